@@ -331,6 +331,8 @@ def _dotted(section: str, location: Sequence) -> str:
 def _no_section(name: str) -> str:
     if name in RENAMED:
         return f"{name} was renamed to {RENAMED[name]}"
+    if name in PAPERS_SECTIONS:
+        return f"{name} has moved to {PAPERS}; delete it here"
     near = _nearest(name, SECTIONS)
     remedy = f"did you mean {near}?" if near else "remove it, or begin its name with x_ if it is yours"
     return f"{name} is no section; {remedy}"

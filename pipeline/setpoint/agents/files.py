@@ -1,4 +1,5 @@
-"""What train_agent leaves: the networks of Li and Pattinson (2025) after each phase, to one file and back."""
+"""What train_agent of the second pipeline leaves: the networks of Li and Pattinson (2025) after each phase,
+to one file and back."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,9 +14,6 @@ from pipeline.store import artifacts
 from pipeline.store.artifacts import read_weights, write_weights
 
 PUBLISHED_SCHEMA = "published agent 1"
-# what the second pipeline's train_agent leaves, in git
-AGENT_FOLDER = Path("datasets/papers/train_agent")
-WEIGHTS = AGENT_FOLDER / "weights.safetensors"
 
 
 def store_published(path: Path, networks: Sequence[QNetwork]) -> None:
