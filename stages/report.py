@@ -84,6 +84,9 @@ OTHERS = {
 MADE = (
     "datasets/papers/made.json",
     "datasets/papers/params.yaml",
+    "datasets/papers/search_agent.json",
+    "datasets/papers/camera.json",
+    "datasets/kept/train_classifier/figures.json",
     "datasets/papers/tic_tac_toe_five_tasks.gcode",
     "datasets/parts/fig9.gcode",
     "datasets/parts/tic_tac_toe.gcode",

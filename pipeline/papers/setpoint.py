@@ -51,8 +51,10 @@ PICTURES = {
 }
 # waits, and the time until a picture shows only what was laid after a move, which the paper does not print
 WAITS_S, VIEWS_S = (3.0, 6.0), (0.0, 6.0, 9.0)
-SHOWN_VIEW_S = 6.0
+SHOWN_VIEW_S, WAITING_RUNS = 6.0, 1000
 RHO, BETTER = 0.7, 0.85
+# the class right as often as the paper's, and always
+ASKED_TO_WAIT = {"wait": RHO, "sure": 1.0}
 CLASSIFIER = "datasets/kept/train_classifier/figures.json"
 
 
@@ -92,14 +94,11 @@ def asked() -> tuple[EpisodeConditions, dict[str, slice]]:
     for name, (flow, temperature) in SINGLE.items():
         for accuracy in (1.0, RHO):
             add(f"{name}_{100 * accuracy:.0f}", nominal(np.full(RUNS, flow), temperature, accuracy=accuracy))
-    for wait_s in WAITS_S:
-        for view_s in VIEWS_S:
-            part = nominal(np.full(RUNS, SINGLE["case_2"][0]), SINGLE["case_2"][1], accuracy=1.0)
-            ones = jnp.ones(RUNS)
-            add(
-                f"wait_{wait_s:.0f}_view_{view_s:.0f}",
-                part._replace(wait_s=wait_s * ones, view_s=view_s * ones),
-            )
+    for (name, accuracy), wait_s, view_s in itertools.product(ASKED_TO_WAIT.items(), WAITS_S, VIEWS_S):
+        start, ones = np.full(WAITING_RUNS, SINGLE["case_2"][0]), jnp.ones(WAITING_RUNS)
+        part = nominal(start, SINGLE["case_2"][1], accuracy=accuracy)
+        part = part._replace(wait_s=wait_s * ones, view_s=view_s * ones)
+        add(f"{name}_{wait_s:.0f}_view_{view_s:.0f}", part)
     return jax.tree.map(lambda *fields: jnp.concatenate(fields), *parts), places
 
 
@@ -167,14 +166,16 @@ APPENDIX = {
 
 
 def waits(path: Trajectory, places: dict[str, slice]) -> dict[str, Any]:
-    """Steps from (30 %, 190 °C) until a run is in the band for good, and how many get there."""
+    """Steps from (30 %, 190 °C) until a run is in the band for good, on average over all runs, one step more
+    than are judged for those that are never; twice the standard error; and how many percent settle."""
     out: dict[str, dict[str, Any]] = {}
     for name, place in places.items():
-        if name.startswith("wait"):
+        if name.startswith(tuple(ASKED_TO_WAIT)):
             of = score.outcomes(np.asarray(path.flow)[place], np.asarray(path.temperature)[place])
             out[name] = {
                 "settled": 100.0 * float(of.settled.mean()),
-                "steps": float(np.median(of.entered[of.settled])) if of.settled.any() else None,
+                "steps": float(of.entered.mean()),
+                "error": 2.0 * float(of.entered.std() / math.sqrt(len(of.entered))),
             }
             if name.endswith(f"view_{SHOWN_VIEW_S:.0f}"):
                 flow = np.asarray(path.flow)[place.start, : SHOWN + 1]
@@ -183,12 +184,10 @@ def waits(path: Trajectory, places: dict[str, slice]) -> dict[str, Any]:
 
 
 def waiting_helps(of: dict[str, Any]) -> bool:
-    """Whether by the long wait more runs settle, or as many in fewer steps, if pictures show the line of
-    before the move for a while."""
+    """Whether the long wait takes fewer steps by more than chance, if the class errs as often as the paper's
+    and pictures show the line of before the move for a while."""
     three, six = (of[f"wait_{wait_s:.0f}_view_{SHOWN_VIEW_S:.0f}"] for wait_s in WAITS_S)
-    if three["settled"] != six["settled"]:
-        return six["settled"] > three["settled"]
-    return (six["steps"] or math.inf) < (three["steps"] or math.inf)
+    return bool(three["steps"] - six["steps"] > math.hypot(three["error"], six["error"]))
 
 
 def scaled(shares: list[list[float]]) -> bool:
@@ -281,6 +280,9 @@ def main() -> None:
         "reward": reward_figures(),
         "learning": rewards_of(agents, how),
         "search": searched,
+        "camera": artifacts.read_json("datasets/papers/camera.json"),
+        # nothing trains it on a CPU: 31 minutes of two cores for the paper's 73 epochs
+        "paper_size": "not run",
         "waiting_helps": waiting_helps(starts_of["waits"]),
         "measured": starts_of[f"starts_{100 * measured():.0f}"],
         "parameters": sizes(agents),
@@ -298,6 +300,7 @@ def main() -> None:
             "waits_s": list(WAITS_S),
             "view_s": SHOWN_VIEW_S,
             "views_s": list(VIEWS_S),
+            "waiting_runs": WAITING_RUNS,
             "semi_axes": [length for pair in PHASES for length in pair],
         },
         "guesses": guesses(how),
