@@ -18,23 +18,15 @@ import numpy as np
 from pipeline.papers import files
 from pipeline.papers.search_agent import TrainAgent, first_key, training
 from pipeline.papers.train_agent import guesses
-from pipeline.setpoint.agents import agent, score, trials
+from pipeline.setpoint.agents import agent, claims, criteria, score, trials
 from pipeline.setpoint.agents.files import restore_published
 from pipeline.setpoint.published import LAMBDA, PHASES, ROTATION
-from pipeline.setpoint.simulation.simulator import (
-    EpisodeConditions,
-    Trajectory,
-    nominal,
-    paper_windows,
-    reward,
-    rollout,
-)
+from pipeline.setpoint.simulation.simulator import Trajectory, nominal, paper_windows, reward, rollout
 from pipeline.setpoint.tables import AGENT_CURVE
 from pipeline.setpoint.vision.vision_transformer import PAPER, parameters, vision_transformer
 from pipeline.store import artifacts, params
 
 COMMAND = "./run dvc repro datasets/papers/dvc.yaml:setpoint"
-RUNS, STEPS, SHOWN, RESTING = 100, 200, 100, 20
 # start of the single runs: flow in percent, temperature in °C
 SINGLE = {
     "figure_3": (191.0, 213.3),
@@ -81,46 +73,20 @@ def networks(how: agent.PublishedTraining, seed: int) -> PhaseNetworks:
     return PhaseNetworks(by_name | {"phase_4_rho_wrong": otherwise}, rewards)
 
 
-def asked() -> tuple[EpisodeConditions, dict[str, slice]]:
-    """The single starts that each agent is asked, as one batch, and where in it."""
-    parts, places, end = [], {}, 0
-
-    def add(name: str, part: EpisodeConditions) -> None:
-        nonlocal end
-        parts.append(part)
-        places[name] = slice(end, end + part.flow.shape[0])
-        end += part.flow.shape[0]
-
-    for name, (flow, temperature) in SINGLE.items():
-        for accuracy in (1.0, RHO):
-            add(f"{name}_{100 * accuracy:.0f}", nominal(np.full(RUNS, flow), temperature, accuracy=accuracy))
-    return jax.tree.map(lambda *fields: jnp.concatenate(fields), *parts), places
-
-
-def single(path: Trajectory, place: slice, *, shown: bool) -> dict[str, Any]:
+def single(path: Trajectory, *, shown: bool) -> dict[str, Any]:
     """One start: where it rests, how far it goes past once it came near, and the first of its runs."""
-    q, u = (np.asarray(a, float)[place, : SHOWN + 1] for a in (path.flow, path.temperature))
-    since = np.maximum.accumulate(np.abs(q - 100.0) <= 10.0 + 1e-3, axis=1)
-    came = since.any(axis=1)
-    least, most = (
-        float(np.median(bound(np.where(since, q, fill), axis=1)[came])) if came.any() else None
-        for bound, fill in ((np.min, np.inf), (np.max, -np.inf))
-    )
-    shares = np.asarray(path.shares, float)[place.start, :SHOWN]
+    q, u = (np.asarray(a, float) for a in (path.flow, path.temperature))
+    shares = np.asarray(path.shares, float)[0]
     run = {
         "flow": [round(float(v), 2) for v in q[0]],
         "temperature": [round(float(v), 2) for v in u[0]],
         "shares": [[round(float(v), 3) for v in row / row.max()] for row in shares],
     }
-    return {
-        "rests_at": float(np.median(q[:, -RESTING:].mean(axis=1))),
-        "rests_at_degC": float(np.median(u[:, -RESTING:].mean(axis=1))),
-        "least": least,
-        "most": most,
+    more = {
+        "rests_at_degC": float(np.median(u[:, -claims.RESTING :].mean(axis=1))),
         "least_degC": float(np.median(u.min(axis=1))),
-        "flow_range": float(np.median(np.ptp(q[:, SHOWN // 2 :], axis=1))),
-        "temperature_range": float(np.median(np.ptp(u[:, SHOWN // 2 :], axis=1))),
-    } | ({"run": run} if shown else {})
+    }
+    return claims.measure_runs(q, u) | more | ({"run": run} if shown else {})
 
 
 def starts(network: agent.QNetwork, accuracy: float) -> dict[str, Any]:
@@ -160,22 +126,25 @@ APPENDIX = {
 }
 
 
-def waits(network: agent.QNetwork, key: jax.Array) -> dict[str, Any]:
+def waits(network: agent.QNetwork) -> dict[str, Any]:
     """Steps from (30 %, 190 °C) until a run is in the band for good, on average over all runs, one step more
     than are judged for those that are never; twice the standard error; and how many percent settle."""
     out: dict[str, dict[str, Any]] = {}
     (flow, temperature), ones = SINGLE["case_2"], jnp.ones(WAITING_RUNS)
+    key = jax.random.key(agent.JUDGED_SEED)
     for (name, accuracy), wait_s, view_s in itertools.product(ASKED_TO_WAIT.items(), WAITS_S, VIEWS_S):
         conditions = nominal(flow * ones, temperature, accuracy=accuracy)
         conditions = conditions._replace(wait_s=wait_s * ones, view_s=view_s * ones)
-        path = rollout(agent.published(network), network, paper_windows(), conditions, key, steps=STEPS)
+        path = rollout(
+            agent.published(network), network, paper_windows(), conditions, key, steps=criteria.STEPS
+        )
         q = np.asarray(path.flow)
         of = score.outcomes(q, np.asarray(path.temperature))
         out[f"{name}_{wait_s:.0f}_view_{view_s:.0f}"] = {
             "settled": 100.0 * float(of.settled.mean()),
             "steps": float(of.entered.mean()),
             "error": 2.0 * float(of.entered.std() / math.sqrt(WAITING_RUNS)),
-            "flow": [round(float(v), 2) for v in q[0, : SHOWN + 1]],
+            "flow": [round(float(v), 2) for v in q[0, : claims.SHOWN + 1]],
         }
     return out
 
@@ -257,23 +226,20 @@ def sizes(networks: PhaseNetworks) -> dict[str, Any]:
 def main() -> None:
     searched = artifacts.read_json("datasets/papers/search_agent.json")
     how = training(params.load(TrainAgent, "train_agent", params.PAPERS), searched["best"])
-    agents, (conditions, places) = networks(how, searched["seed"]), asked()
-    key, accuracies = jax.random.key(searched["seed"] + 2), (1.0, RHO, 1 - RHO, BETTER, measured())
+    agents, accuracies = networks(how, searched["seed"]), (1.0, RHO, 1 - RHO, BETTER, measured())
     result: dict[str, Any] = {"command": COMMAND, "agents": {}}
     for name, network in agents.by_name.items():
-        path = rollout(agent.published(network), network, paper_windows(), conditions, key, steps=STEPS)
         row = {f"starts_{100 * accuracy:.0f}": starts(network, accuracy) for accuracy in accuracies}
-        row |= {
-            place: single(path, where, shown=(name, place) in PICTURES)
-            for place, where in places.items()
-            if place.startswith(("case", "figure"))
-        }
+        for (start, (flow, temperature)), accuracy in itertools.product(SINGLE.items(), (1.0, RHO)):
+            place = f"{start}_{100 * accuracy:.0f}"
+            path = claims.run_start(network, flow, temperature, accuracy=accuracy)
+            row[place] = single(path, shown=(name, place) in PICTURES)
         result["agents"][name] = row
         print(
             name, {place: round(of["settled"], 1) for place, of in row.items() if "settled" in of}, flush=True
         )
     starts_of = result["agents"]["phase_4"]
-    starts_of["waits"] = waits(agents.by_name["phase_4"], key)
+    starts_of["waits"] = waits(agents.by_name["phase_4"])
     result |= {
         "reward": reward_figures(),
         "learning": rewards_of(agents, how),
@@ -291,9 +257,9 @@ def main() -> None:
             "right_percent": 100 * RHO,
             "better_percent": 100 * BETTER,
             "measured_percent": 100 * measured(),
-            "runs": RUNS,
-            "shown": SHOWN,
-            "resting": RESTING,
+            "runs": agent.RUNS,
+            "shown": claims.SHOWN,
+            "resting": claims.RESTING,
             "starts": {name: list(start) for name, start in SINGLE.items()},
             "waits_s": list(WAITS_S),
             "view_s": SHOWN_VIEW_S,

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from pipeline.papers import made
@@ -43,13 +42,12 @@ def learning_curve(published: agent.PublishedAgent) -> dict[str, list]:
     return dict(zip(names, map(list, zip(*points, strict=True)), strict=True))
 
 
-def figures(how: agent.PublishedTraining, seed: int, networks: Sequence[agent.QNetwork]) -> dict[str, Any]:
+def figures(how: agent.PublishedTraining, networks: Sequence[agent.QNetwork]) -> dict[str, Any]:
     """The agent after three phases and after the last one, if the class is always right and if it is not, on
     the paper's simulator; what the paper claims of it; and what the paper does not print."""
-    key = jax.random.key(seed + 2)
     return claims.simulated_figures(networks) | {
         "parameters": {"li_2025": claims.parameters(networks[0])},
-        "claims": claims.compare_starts(networks, key, accuracy=how.accuracy, steps=how.dqn.episode),
+        "claims": claims.compare_starts(networks, accuracy=how.accuracy),
         "guesses": guesses(how),
     }
 
@@ -78,7 +76,7 @@ def main() -> None:
     FOLDER.mkdir(parents=True, exist_ok=True)
     store_published(FOLDER / "weights.safetensors", published.networks)
     artifacts.write_table(FOLDER / "agents.parquet", AGENT_CURVE, learning_curve(published))
-    artifacts.write_json(FOLDER / "figures.json", figures(how, searched["seed"], published.networks))
+    artifacts.write_json(FOLDER / "figures.json", figures(how, published.networks))
     made.record("train_agent")
 
 

@@ -342,10 +342,10 @@ def test_all_pages_tell_the_same_figures_of_one_agent():
 
 def test_a_single_start_is_told_by_its_own_runs():
     class Path_:
-        flow = np.array([[200.0] * 40 + [100.0, 80.0] * 31, [200.0] * 40 + [100.0, 90.0] * 31])
-        temperature = np.full((2, 102), 210.0)
+        flow = np.array([[200.0] * 41 + [100.0, 80.0] * 30, [200.0] * 41 + [100.0, 90.0] * 30])
+        temperature = np.full((2, 101), 210.0)
         shares = np.full((2, 101, 3), 1 / 3)
 
-    told = papers_setpoint.single(Path_, slice(0, 2), shown=False)
+    told = papers_setpoint.single(Path_, shown=False)
     assert (told["least"], told["most"], told["flow_range"]) == (85.0, 100.0, 15.0)
     assert told["rests_at"] == pytest.approx(92.5, abs=0.5) and "run" not in told

@@ -29,7 +29,7 @@ def test_the_history_is_the_width_of_the_network_s_camera_input(settings):
     networks = agent.train_published(jax.random.key(0), how).networks
     assert [network.vision.in_features for network in networks] == [7 + 3] * 4
     assert {agent.history_of(network) for network in networks} == {7}
-    told = claims.compare_starts(networks, jax.random.key(0), accuracy=0.7, steps=10)
+    told = claims.compare_starts(networks, accuracy=0.7)
     assert told["300 %, 230 °C"]["printed"] == {"rests_at": 95.0, "least": 75.0, "most": 130.0}
     assert all(np.isfinite(claim["measured"]["rests_at"]) for claim in told.values())
 
@@ -107,7 +107,7 @@ def test_a_start_is_told_as_the_paper_tells_it(monkeypatch):
     networks = [QNetwork(jax.random.key(0))] * 4
 
     def claimed():
-        told = claims.compare_starts(networks, jax.random.key(0), accuracy=0.7, steps=10)
+        told = claims.compare_starts(networks, accuracy=0.7)
         return told["300 %, 230 °C"]["measured"]
 
     assert claimed() == {"rests_at": 95, "least": 75, "most": 130, "flow_range": 0, "temperature_range": 5}

@@ -7,11 +7,12 @@ import jax
 import numpy as np
 
 from pipeline.setpoint.agents import agent
-from pipeline.setpoint.agents.agent import RUNS, run_starts
+from pipeline.setpoint.agents.agent import JUDGED_SEED, RUNS, run_starts
 from pipeline.setpoint.agents.score import judge
 from pipeline.setpoint.simulation.simulator import Trajectory, nominal, paper_windows, rollout
 
-RESTING = 20  # decisions at the end over which a run has come to rest
+# decisions of a run from a single start, and those at its end over which it has come to rest
+SHOWN, RESTING = 100, 20
 
 
 def simulated_figures(networks: Sequence[agent.QNetwork]) -> dict[str, dict[str, Any]]:
@@ -25,9 +26,16 @@ def simulated_figures(networks: Sequence[agent.QNetwork]) -> dict[str, dict[str,
     }
 
 
-def compare_starts(
-    networks: Sequence[agent.QNetwork], key: jax.Array, *, accuracy: float, steps: int
-) -> dict[str, dict[str, Any]]:
+def run_start(network: agent.QNetwork, flow: float, temperature: float, *, accuracy: float) -> Trajectory:
+    """RUNS of SHOWN decisions from one start in percent and °C, on the draws of `run_starts`' seed."""
+    key, conditions = (
+        jax.random.key(JUDGED_SEED),
+        nominal(np.full(RUNS, flow), temperature, accuracy=accuracy),
+    )
+    return rollout(agent.published(network), network, paper_windows(), conditions, key, steps=SHOWN)
+
+
+def compare_starts(networks: Sequence[agent.QNetwork], *, accuracy: float) -> dict[str, dict[str, Any]]:
     """What Li and Pattinson (2025) print of single starts (sections 3.3 and 3.4, figures 7 and 8), beside
     what RUNS runs of ours come to: medians, in percent of flow and °C. `accuracy` is the last phase's.
 
@@ -48,8 +56,7 @@ def compare_starts(
     }
     compared = {}
     for name, (claim, network, flow, temperature, right) in printed.items():
-        conditions = nominal(np.full(RUNS, flow), temperature, accuracy=right)
-        path = rollout(agent.published(network), network, paper_windows(), conditions, key, steps=steps)
+        path = run_start(network, flow, temperature, accuracy=right)
         compared[name] = {
             "printed": claim,
             "measured": measure_runs(np.asarray(path.flow, float), np.asarray(path.temperature, float)),
