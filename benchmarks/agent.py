@@ -1,8 +1,8 @@
 """The paper's agent over training seeds, and the speed of
 training.
 
-`./run python -m benchmarks.agent` trains with seeds 0 .. 4 by the numbers of params.expert.yaml, judges 21
-starts x 100 runs on the paper's simulator, and writes its part of benchmarks/results.json.
+`./run python -m benchmarks.agent` trains with seeds 0 .. 4 by the numbers of the kept agent, judges 21 starts
+x 100 runs on the paper's simulator, and writes its part of benchmarks/results.json.
 """
 
 import time
@@ -15,12 +15,11 @@ import optax
 
 from benchmarks import results
 from benchmarks.results import Row
+from pipeline.papers.search_agent import TrainAgent, first_key, training
 from pipeline.setpoint.agents import agent, trials
-from pipeline.setpoint.agents.score import RunScore
+from pipeline.setpoint.agents.score import RunScore, judge
 from pipeline.setpoint.simulation.simulator import paper_windows, rollout
-from pipeline.store import params
-from stages import train_agent
-from stages.train_agent import Li2025, TrainAgent
+from pipeline.store import artifacts, params
 
 UPDATES = 500  # of each timing
 
@@ -33,30 +32,25 @@ def figures(score: RunScore) -> dict[str, float]:
     }
 
 
-def one_seed(settings: TrainAgent, runs: int) -> dict[str, Any]:
+def one_seed(how: agent.PublishedTraining, seed: int) -> dict[str, Any]:
     """Figures of the paper's agent after phases 3 and 4 by the accuracy of the windows, and the seconds and
     CPU seconds of training."""
     wall, cpu = time.perf_counter(), time.process_time()
-    networks = train_agent.published_agent(settings, None, lambda *_: None).networks
+    networks = agent.train_published(first_key(seed), how).networks
     row: dict[str, Any] = {
         "train_s": round(time.perf_counter() - wall, 1),
         "train_cpu_s": round(time.process_time() - cpu, 1),
-        "claims": train_agent.paper_claims(settings, networks),
     }
-    published, key = agent.greedy(agent.paper_encoder(settings.li_2025.history)), jax.random.key(1000)
     for name, network in {"phases 1-3": networks[2], "four phases": networks[-1]}.items():
+        paths = {accuracy: agent.run_starts(network, accuracy=accuracy) for accuracy in (1.0, 0.7)}
         row[name] = {
-            f"accuracy {accuracy:g}": figures(
-                trials.evaluate(
-                    published, network, paper_windows(), trials.starts(runs, accuracy=accuracy), key
-                )
-            )
-            for accuracy in (1.0, 0.7)
+            f"accuracy {accuracy:g}": figures(judge(np.asarray(path.flow), np.asarray(path.temperature)))
+            for accuracy, path in paths.items()
         }
     return row
 
 
-def speeds(settings: Li2025) -> dict[str, Any]:
+def speeds(settings: agent.DqnSettings) -> dict[str, Any]:
     """Updates of the whole loop, rollout steps with 1,024 environments, and milliseconds of one action;
     compiling is not counted. Beside them the matrix products that an update cannot do without, alone: on a
     machine that others use too, the ratio is what can be compared."""
@@ -70,7 +64,7 @@ def speeds(settings: Li2025) -> dict[str, Any]:
     )
     train_state = agent.DqnState(network, network, optimiser.init(network))
     controller = agent.greedy(encoder)
-    problem = agent.DqnProblem(encoder, env, optimiser, agent.dqn_target, train_agent.dqn_settings(settings))
+    problem = agent.DqnProblem(encoder, env, optimiser, agent.dqn_target, settings)
     conditions = jax.tree.map(lambda leaf: leaf[:1024], trials.starts(49, accuracy=1.0))
     act = jax.jit(lambda memory, observation: controller.act(network, memory, observation, None))
     observation = agent.begin(
@@ -145,7 +139,7 @@ def seconds(work) -> np.ndarray:
     return np.median(taken[1:], axis=0)
 
 
-SEEDS, RUNS = 5, 100
+SEEDS = 5
 # its program needs torch: git show 23e84ac:benchmarks/agent_peer.py
 BASELINES3 = "2.85 times stable-baselines3's whole loop on another day, commit 23e84ac"
 
@@ -176,9 +170,9 @@ def rows(speed: dict[str, Any], seeds: list[dict[str, Any]]) -> list[Row]:
 
 
 def main() -> None:
-    settings = params.load(TrainAgent, "train_agent")
-    seeds = [one_seed(settings.model_copy(update={"seed": seed}), RUNS) for seed in range(SEEDS)]
-    results.write("agent", rows(speeds(settings.li_2025), seeds))
+    best = artifacts.read_json("datasets/papers/search_agent.json")["best"]
+    how = training(params.load(TrainAgent, "train_agent", params.PAPERS), best)
+    results.write("agent", rows(speeds(how.dqn), [one_seed(how, seed) for seed in range(SEEDS)]))
 
 
 if __name__ == "__main__":

@@ -129,7 +129,7 @@ def inspect(arguments: argparse.Namespace) -> None:
 
 def quick(arguments: argparse.Namespace) -> None:
     """Write a first page to quick/: every loop at the sizes of params.quick.yaml,
-    with a classifier and agents that git keeps. datasets/, reports/ and dvc.lock stay as they are."""
+    with a classifier that git keeps. datasets/, reports/ and dvc.lock stay as they are."""
     from pipeline import quick as looking
 
     print(printable(looking.keep() if arguments.keep else looking.quick()))
@@ -544,9 +544,7 @@ def main() -> None:
     command.set_defaults(run=inspect)
     command = commands.add_parser("quick", help=quick.__doc__, description=quick.__doc__)
     command.add_argument(
-        "--keep",
-        action="store_true",
-        help="keep the classifier and agents of this checkout's full run for it",
+        "--keep", action="store_true", help="keep the classifier of this checkout's full run for it"
     )
     command.set_defaults(run=quick)
     command = commands.add_parser("init", help=init.__doc__, description=init.__doc__)

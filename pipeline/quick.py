@@ -24,9 +24,9 @@ SECTIONS = (
     "evaluate_setpoint", "evaluate_temperature", "identify_plant", "panel", "train_ilc", "tune_weights",
 )  # fmt: skip
 # what takes minutes of training, taken from a full run that git keeps; frames are only rendered to train on
-KEPT, TRAINED = Path("datasets/kept"), ("train_classifier", "train_agent")
+KEPT, TRAINED = Path("datasets/kept"), "train_classifier"
 # certificates and exports come from a full run only
-LEFT_OUT = ("render_frames", *TRAINED, "certify", "export_controllers")
+LEFT_OUT = ("render_frames", TRAINED, "certify", "export_controllers")
 # folders that are only read; of the code the pages show the digest
 LINKED = ("datasets/raw", "datasets/parts", "datasets/papers", "datasets/published", "pipeline", "stages")
 
@@ -182,7 +182,8 @@ def _furnish(folder: Path, files: Files, smaller: list[tuple[str, str, str]], ro
     elif loops["setpoint"]:
         commit = _copy_kept(folder)
         notes.append(
-            f"Classifier and agents are those of a full run, of commit {commit}: nothing is trained."
+            f"The classifier is that of a full run, of commit {commit}, and the paper's agent the one "
+            "of every run: nothing is trained."
         )
     artifacts.write_json(folder / QUICK_LOOK, {"notes": notes, "smaller": smaller})
     return loops
@@ -210,23 +211,13 @@ def _copy_kept(folder: Path) -> str:
 
 
 def keep() -> str:
-    """Puts the classifier and the agents of this checkout's full run into KEPT, in place of those before.
-    Raises ValueError where there is none."""
-    found = [
-        path
-        for stage in TRAINED
-        for path in sorted(Path("datasets", stage).rglob("*"))
-        if path.is_file() and "live" not in path.parts
-    ]
-    absent = [
-        stage for stage in TRAINED if not artifacts.exists(Path("datasets", stage, "weights.safetensors"))
-    ]
-    if absent:
-        raise ValueError(
-            f"datasets/{absent[0]}: expected what training left, found none; ./run dvc repro {absent[0]}"
-        )
-    for name in TRAINED:
-        shutil.rmtree(KEPT / name, ignore_errors=True)
+    """Puts the classifier of this checkout's full run into KEPT, in place of the one before. Raises
+    ValueError where there is none."""
+    folder = Path("datasets", TRAINED)
+    if not artifacts.exists(folder / "weights.safetensors"):
+        raise ValueError(f"{folder}: expected what training left, found none; ./run dvc repro {TRAINED}")
+    shutil.rmtree(KEPT / TRAINED, ignore_errors=True)
+    found = (path for path in sorted(folder.rglob("*")) if path.is_file() and "live" not in path.parts)
     names = {path.relative_to("datasets").as_posix(): path for path in found}
     for name, path in names.items():
         (KEPT / name).parent.mkdir(parents=True, exist_ok=True)
@@ -235,7 +226,7 @@ def keep() -> str:
     head = subprocess.run(
         ["git", "rev-parse", "--short=8", "HEAD"], capture_output=True, text=True, check=False
     )
-    made = f"./run dvc repro {' '.join(TRAINED)}; ./run beadline quick --keep"
+    made = f"./run dvc repro {TRAINED}; ./run beadline quick --keep"
     artifacts.write_json(KEPT / "kept.json", {"commit": head.stdout.strip(), "made_by": made, "files": files})
     return f"{KEPT}: {len(files)} files kept of commit {head.stdout.strip()}; commit them"
 

@@ -33,7 +33,6 @@ SECTIONS = {
     "segment_library": "stages.segment_library:SegmentLibrary",
     "setpoint_material": "pipeline.setpoint.settings:SetpointMaterial",
     "tracking": "pipeline.temperature.settings:Tracking",
-    "train_agent": "stages.train_agent:TrainAgent",
     "train_classifier": "pipeline.setpoint.settings:TrainClassifier",
     "train_ilc": "pipeline.deposition.settings:TrainIlc",
     "tune_weights": "pipeline.temperature.settings:TuneWeights",

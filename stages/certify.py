@@ -43,7 +43,7 @@ UNDISTURBED = (
 # what the setpoint loop's files are made of: without them the temperature loop is certified alone
 SEEN = (
     "datasets/train_classifier/weights.safetensors",
-    "datasets/train_agent/weights.safetensors",
+    "datasets/papers/train_agent/weights.safetensors",
     "datasets/evaluate_setpoint/choice.json",
 )
 NOT_ASKED = "Not asked: loops.{} is false."
@@ -269,7 +269,7 @@ def certify_setpoint(folder: Path, seed: int) -> dict[str, Any]:
     )
     columns = artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS)
     learned = window_tables(columns, WINDOW_PARTS)["learn"]
-    agent = restore_published("datasets/train_agent/weights.safetensors")
+    agent = restore_published("datasets/papers/train_agent/weights.safetensors")
     baselines = params.load(EvaluateSetpoint, "evaluate_setpoint").baselines
     default = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
     built = build_controllers(baselines, agent, learned).get(default)

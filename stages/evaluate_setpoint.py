@@ -1,5 +1,5 @@
-"""Agents and classifier -> who sets flow and temperature: reads datasets/train_classifier
-and datasets/train_agent; writes datasets/evaluate_setpoint: scoreboard.parquet,
+"""Agents and classifier -> who sets flow and temperature: reads datasets/train_classifier and the paper's
+agent from datasets/papers/train_agent; writes datasets/evaluate_setpoint: scoreboard.parquet,
 paths.parquet of one run from each start, in the case that decides too, decisions.parquet of
 two episodes through pixels, and choice.json: the default with its worst case, and the best model-based
 controller against the best data-driven one."""
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 WEIGHTS = "datasets/train_classifier/weights.safetensors"
 CALIBRATION = "datasets/train_classifier/calibration.parquet"
-AGENTS = "datasets/train_agent/weights.safetensors"
+AGENTS = "datasets/papers/train_agent/weights.safetensors"
 # figures of control that git keeps and that runs are compared by
 METRICS = (
     "default",

@@ -30,7 +30,7 @@ FIGURES = {
     "segment_library": "datasets/segment_library/figures.json",
     "compose_parts": "datasets/compose_parts/figures.json",
     "train_classifier": "datasets/train_classifier/figures.json",
-    "train_agent": "datasets/train_agent/figures.json",
+    "train_agent": "datasets/papers/train_agent/figures.json",
     "evaluate_setpoint": "datasets/evaluate_setpoint/figures.json",
     "verdict": "datasets/verdict/figures.json",
     "export_controllers": "datasets/export_controllers/figures.json",
@@ -44,7 +44,7 @@ FOLDERS = {
     "segment_library": "datasets/segment_library",
     "compose_parts": "datasets/compose_parts",
     "train_classifier": "datasets/train_classifier",
-    "train_agent": "datasets/train_agent",
+    "train_agent": "datasets/papers/train_agent",
     "evaluate_setpoint": "datasets/evaluate_setpoint",
     "export_controllers": "datasets/export_controllers",
 }
@@ -84,6 +84,9 @@ OTHERS = {
 MADE = (
     "datasets/papers/made.json",
     "datasets/papers/params.yaml",
+    "datasets/papers/search_agent.json",
+    "datasets/papers/camera.json",
+    "datasets/kept/train_classifier/figures.json",
     "datasets/papers/tic_tac_toe_five_tasks.gcode",
     "datasets/parts/fig9.gcode",
     "datasets/parts/tic_tac_toe.gcode",

@@ -426,8 +426,8 @@ def expected_of_paper(root: Path, stage: str) -> dict[str, set[str]]:
     code = {path for path, room in rooms.items() if room.split("/")[0] in methods and room != "papers/plain"}
     # `relearned` plays the root's stages in a folder of its own
     name = f"pipeline/papers/{stage}.py"
-    read = paths(name, parsed(root / name))[0] - {f"datasets/papers/{stage}.json", params.PAPERS}
-    read = {path for path in read if not path.startswith(UNTRACKED)}
+    own = {f"datasets/papers/{stage}.json", f"datasets/papers/{stage}", params.PAPERS}
+    read = {path for path in paths(name, parsed(root / name))[0] - own if not path.startswith(UNTRACKED)}
     keys = {key for key in wanted["params"] if not key.startswith("loops.")}
     return {"code": code, "deps": read, "params": keys, "outs": set(), "metrics": set()}
 

@@ -100,7 +100,7 @@ def test_every_page_of_a_quick_look_says_so(looked):
     for name in PAGES:
         text = (looked[0] / f"quick/reports/{name}.html").read_text()
         assert text.count('role="note"><strong>Quick look.</strong>') == 1
-        assert "panel.judging.plants" in text and "those of a full run, of commit" in text
+        assert "panel.judging.plants" in text and "that of a full run, of commit" in text
         assert not any(f"{word} (simulation)" in text for word in ("Pass", "Fail", "Undecided"))
 
 
@@ -130,7 +130,7 @@ def test_a_killed_quick_look_shows_nothing_and_the_next_starts_clean(looked, mon
     before = written(folder / "quick")
     child = subprocess.Popen([sys.executable, "-c", KILLED], cwd=folder)
     half = folder / f".quick.{child.pid}.tmp"
-    while not (half / "datasets/train_agent/weights.safetensors").exists() and child.poll() is None:
+    while not (half / "datasets/train_classifier/weights.safetensors").exists() and child.poll() is None:
         time.sleep(0.02)
     child.send_signal(signal.SIGKILL)
     child.wait()
@@ -268,7 +268,7 @@ def test_every_stage_but_training_and_export_runs_after_what_it_reads(monkeypatc
     assert set(order) == every - set(quick.LEFT_OUT)
     off = quick.chosen_stages(files, ALL_ON | {"setpoint": False}, Path("dvc.yaml"))
     assert [name for name, is_on in off.items() if not is_on] == [
-        *("render_frames", "train_classifier", "train_agent", "evaluate_setpoint")
+        *("render_frames", "train_classifier", "evaluate_setpoint")
     ]
     assert off["report"] and off["train_ilc"]
     wires = yaml.safe_load(Path("dvc.yaml").read_text())["stages"]
@@ -292,18 +292,18 @@ def test_what_is_kept_is_whole_and_read_by_the_code_of_today():
     assert {"learn", "choose", "judge"} <= set(
         window_tables(artifacts.read_table(model / "windows.parquet", WINDOWS), WINDOW_PARTS)
     )
-    assert len(restore_published(kept / "train_agent/weights.safetensors").networks) == 4
+    assert len(restore_published(ROOT / "datasets/papers/train_agent/weights.safetensors").networks) == 4
 
 
 def test_a_kept_file_that_differs_is_refused_by_name(checkout, beadline):
     os.chdir(checkout)
     Path("datasets/kept").unlink()
     shutil.copytree(ROOT / "datasets/kept", "datasets/kept")
-    with Path("datasets/kept/train_agent/weights.safetensors").open("r+b") as file:
+    with Path("datasets/kept/train_classifier/weights.safetensors").open("r+b") as file:
         file.seek(4000)
         file.write(b"!")
     status, _, told = beadline("quick")
-    assert status == 1 and "datasets/kept/train_agent/weights.safetensors: expected SHA-256" in told
+    assert status == 1 and "datasets/kept/train_classifier/weights.safetensors: expected SHA-256" in told
     for content in ("[]", "{}", None):
         index = Path("datasets/kept/kept.json")
         index.unlink() if content is None else index.write_text(content)

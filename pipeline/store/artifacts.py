@@ -596,8 +596,8 @@ def remedy(path: str | Path) -> str:
     parts = Path(path).parts
     if parts[:2] == ("reports", "metrics"):
         return f"make it again with ./run dvc repro {Path(path).stem}"
-    if parts[:2] == ("datasets", "kept"):
-        return "restore it with git checkout datasets/kept"
+    if parts[:2] in (("datasets", "kept"), ("datasets", "papers")):
+        return f"restore it with git checkout datasets/{parts[1]}"
     if parts[:1] == ("datasets",) and len(parts) > 2 and parts[1] not in ("raw", "published", "memo"):
         stage = re.sub(r"^[.](.+)[.][0-9]+$", r"\1", parts[1])
         return f"make it again with ./run dvc repro {stage}"

@@ -39,14 +39,13 @@ SECTIONS = (
     "segment_library",
     "setpoint_material",
     "tracking",
-    "train_agent",
     "render_frames",
     "train_classifier",
     "train_ilc",
     "tune_weights",
 )
 # the second pipeline has a file of its own, which no owner of a machine needs to know
-PAPERS, PAPERS_SECTIONS = "datasets/papers/params.yaml", ("reproduce_study",)
+PAPERS, PAPERS_SECTIONS = "datasets/papers/params.yaml", ("reproduce_study", "train_agent")
 # old dotted key or section -> new one, for one version
 RENAMED: dict[str, str] = {"export_controllers": "certify"}
 
@@ -332,6 +331,8 @@ def _dotted(section: str, location: Sequence) -> str:
 def _no_section(name: str) -> str:
     if name in RENAMED:
         return f"{name} was renamed to {RENAMED[name]}"
+    if name in PAPERS_SECTIONS:
+        return f"{name} has moved to {PAPERS}; delete it here"
     near = _nearest(name, SECTIONS)
     remedy = f"did you mean {near}?" if near else "remove it, or begin its name with x_ if it is yours"
     return f"{name} is no section; {remedy}"

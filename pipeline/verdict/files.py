@@ -24,7 +24,6 @@ FIGURES = {
     "segment_library": "datasets/segment_library/figures.json",
     "compose_parts": "datasets/compose_parts/figures.json",
     "train_classifier": "datasets/train_classifier/figures.json",
-    "train_agent": "datasets/train_agent/figures.json",
     "evaluate_setpoint": "datasets/evaluate_setpoint/figures.json",
 }
 TABLES = {

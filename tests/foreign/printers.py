@@ -241,8 +241,7 @@ def loop(
         reason = np.where(blind, actuation.FEW, actuation.still(np.float32(seen), np.float32(last)))
         shares = window_shares(seen, camera.spread)
         shown = _observation(shares, seen, since, temperature, sent.value[:, 1], acted)
-        memory, action, reason = _decided(controller, parameters, memory, shown, jnp.asarray(reason), keys)
-        reason = np.asarray(reason)
+        memory, action = _decided(controller, parameters, memory, shown, jnp.asarray(reason), keys)
         acts, clock = reason == actuation.ACTS, acted % 10 == 0
         wanted = np.stack(
             [
@@ -253,7 +252,7 @@ def loop(
         )
         before, sent = sent.value, actuation.moved(sent, wanted, t * (wait_s + WINDOW_S), LIMITS)
         move = sent.value[:, 0] - before[:, 0]
-        since = move + np.where(actuation.is_evidence(reason), 0.0, since)
+        since = move + np.where(acts, 0.0, since)
         acted = acted + acts
         clog = _clogged(rng, case, t + 1, *clog)
         state, flow = printer.feed(rng, case, state, move, wait_s, clog[0])

@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 
 from tests.foreign import nozzle_pictures
-from tests.mission.conftest import ROOT, Project
+from tests.mission.conftest import Project
 
 KEPT = "datasets/kept"
 SHOTS = 4
@@ -22,12 +22,6 @@ SMALL = {
     "train_classifier.window": SHOTS,
     "train_classifier.false_alarms": 0.1,
     **{f"train_classifier.small.{key}": value for key, value in RECIPE.items()},
-    "train_agent.runs": 1,
-    "train_agent.li_2025.updates": [20, 20, 20, 20],
-    **{
-        f"train_agent.li_2025.{key}": value
-        for key, value in {"environments": 4, "batch": 16, "capacity": 1000}.items()
-    },
     "evaluate_setpoint.runs": 1,
     "evaluate_setpoint.pixels.starts": 1,
     "evaluate_setpoint.pixels.decisions": 20,
@@ -40,7 +34,7 @@ RENDERED = {
     "render_frames.sweep_windows": {"learn": 1.0, "choose": 1.0, "judge": 1.0},
     "render_frames.camera_segments": 240,
 }
-STAGES = ("render_frames", "train_classifier", "train_agent", "evaluate_setpoint")
+STAGES = ("render_frames", "train_classifier", "evaluate_setpoint")
 
 
 # ---- frames -> classifier -> agent -> verdict
@@ -83,15 +77,14 @@ def plain(text: str) -> str:
 
 @pytest.fixture
 def kept(root, tmp_path) -> Project:
-    """A project with the classifier and the agents that git keeps; nothing was trained here."""
-    project = decided_by_kept_agents(Project(tmp_path / "kept").make())
+    """A project with the classifier that git keeps; nothing was trained here."""
+    project = decided_by_the_filter(Project(tmp_path / "kept").make())
     shutil.copytree(root / KEPT / "train_classifier", project.folder / "datasets/train_classifier")
     return project
 
 
-def decided_by_kept_agents(project: Project) -> Project:
-    """The project with the agents that git keeps, and the default of the bundled study."""
-    shutil.copytree(ROOT / KEPT / "train_agent", project.folder / "datasets/train_agent")
+def decided_by_the_filter(project: Project) -> Project:
+    """The project with the default of the bundled study."""
     choice = project.folder / "datasets/evaluate_setpoint/choice.json"
     choice.parent.mkdir()
     choice.write_text(json.dumps({"name": "Bayes filter"}))
@@ -131,7 +124,7 @@ def own_pictures(made_once) -> Project:
         nozzle_pictures.write_prints(raw, 12, flows, 2 * SHOTS, np.random.default_rng(3))
         project.declare(SMALL | {"train_classifier.source": "recordings"}).commit()
         project.run("dvc", "repro", "train_classifier")
-        decided_by_kept_agents(project)
+        decided_by_the_filter(project)
 
     return Project(made_once("own_pictures", make))
 

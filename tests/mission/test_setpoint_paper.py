@@ -8,11 +8,11 @@ import jax
 import numpy as np
 import pytest
 
+from pipeline.papers.search_agent import TrainAgent
 from pipeline.setpoint.agents.agent import QNetwork
-from pipeline.setpoint.published import PHASES, ROTATION
+from pipeline.setpoint.published import LAMBDA, PHASES, ROTATION
 from pipeline.setpoint.vision.vision_transformer import PAPER, parameters, vision_transformer
 from pipeline.store import params
-from stages.train_agent import TrainAgent
 
 
 @pytest.fixture(scope="module")
@@ -34,12 +34,12 @@ def test_the_networks_have_as_many_parameters_as_table_1_prints(printed):
 
 
 def test_the_agent_is_trained_with_the_settings_of_table_2(printed, root):
-    own = params.load(TrainAgent, "train_agent", root / "params.yaml").li_2025
+    own = params.load(TrainAgent, "train_agent", root / params.PAPERS)
     network = QNetwork(jax.random.key(0))
     ours = {
         "Discount γ": own.gamma,
         "Soft update τ": own.tau,
-        "Flow actions to one of temperature λ": own.flow_actions,
+        "Flow actions to one of temperature λ": LAMBDA,
         "Batch size": own.batch,
         "Learning rate": own.learning_rate,
         "Episode, steps": own.episode,

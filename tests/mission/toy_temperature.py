@@ -23,8 +23,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PARAMS = ("params.yaml", "params.expert.yaml")
 # stages of the other loops, and the paper's own study, which no recording touches
 OTHERS = {
-    "train_ilc", "segment_library", "compose_parts", "render_frames", "train_classifier", "train_agent",
-    "evaluate_setpoint", "reproduce_study",
+    "train_ilc", "segment_library", "compose_parts", "render_frames", "train_classifier", "evaluate_setpoint",
+    "reproduce_study",
 }  # fmt: skip
 # read where they lie
 LINKED = ("datasets/published", "datasets/papers", "datasets/parts", "pipeline", "stages")
@@ -57,9 +57,8 @@ def begin(folder: Path, source: Path = ROOT) -> Path:
     for name in LINKED:
         if (ROOT / name).exists():
             (folder / name).symlink_to(ROOT / name)
-    for name in ("train_classifier", "train_agent"):
-        if (ROOT / "datasets/kept" / name).exists():
-            shutil.copytree(ROOT / "datasets/kept" / name, folder / "datasets" / name)
+    if (ROOT / "datasets/kept/train_classifier").exists():
+        shutil.copytree(ROOT / "datasets/kept/train_classifier", folder / "datasets/train_classifier")
     # the export asks who decides in the setpoint loop, which is not played here
     (folder / "datasets/evaluate_setpoint").mkdir()
     (folder / "datasets/evaluate_setpoint/choice.json").write_text('{"name": "bayes"}')

@@ -84,7 +84,7 @@ def metrics(settling=26.0, stay=71.0, flow=2.5, winner="pi_simc"):
 
 def parameters(**tune):
     """Both files of parameters, with these keys of tune_weights."""
-    expert = {"tune_weights": {"seed": 1, "budget": 60} | tune, "train_agent": {"seed": 3}}
+    expert = {"tune_weights": {"seed": 1, "budget": 60} | tune, "evaluate_setpoint": {"seed": 3}}
     return {
         "params.yaml": "# what the owner sets\n" + yaml.safe_dump({"plant": {"sample_time_s": 1.0}}),
         "params.expert.yaml": yaml.safe_dump(expert),

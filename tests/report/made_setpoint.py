@@ -372,13 +372,15 @@ def agents():
             for k in range(1, 11)
         ]
     artifacts.write_table(
-        "datasets/train_agent/agents.parquet", tables.AGENT_CURVE, columns(tables.AGENT_CURVE, rows)
+        "datasets/papers/train_agent/agents.parquet", tables.AGENT_CURVE, columns(tables.AGENT_CURVE, rows)
     )
 
 
 def write():
     """Everything below the working directory; the filter is the default and passes its rules."""
-    for stage, found in metrics().items():
+    figures = metrics()
+    artifacts.write_json("datasets/papers/train_agent/figures.json", figures.pop("train_agent"))
+    for stage, found in figures.items():
         artifacts.write_metrics(stage, found)
     scoreboard()
     choice()

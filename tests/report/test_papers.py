@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.papers import deposition as papers_deposition
-from pipeline.papers import published
+from pipeline.papers import published, search_agent, train_agent
 from pipeline.papers import setpoint as papers_setpoint
 from pipeline.papers import temperature as papers_temperature
 from pipeline.papers.study import exact_gains
@@ -22,8 +22,6 @@ from pipeline.store import params
 from pipeline.temperature.plant import baam
 from pipeline.temperature.tracking import gains
 from pipeline.verdict.verdict import Missing
-from stages import train_agent
-from stages.train_agent import TrainAgent
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEDS = {
@@ -43,6 +41,9 @@ METRICS = {
 
 def printed(name):
     return tomllib.loads(Path(PAPERS[name][0]).read_text(encoding="utf-8"))
+
+
+SEARCHED = ROOT / "datasets/papers/search_agent.json"
 
 
 def results(name):
@@ -319,19 +320,32 @@ def test_the_part_with_all_five_tasks_has_them_in_both_materials():
 
 
 def test_the_setpoint_results_are_of_the_settings_in_force():
-    settings, found = params.load(TrainAgent, "train_agent", ROOT / "params.yaml"), results("setpoint")
-    assert found["guesses"] == json.loads(json.dumps(train_agent.guesses(settings.li_2025)))
-    assert found["table_2"] == pytest.approx(papers_setpoint.table_2(settings))
+    settings = params.load(search_agent.TrainAgent, "train_agent", ROOT / params.PAPERS)
+    found, searched = results("setpoint"), json.loads(SEARCHED.read_text(encoding="utf-8"))
+    how = search_agent.training(settings, searched["best"])
+    assert found["guesses"] == json.loads(json.dumps(train_agent.guesses(how)))
+    assert found["table_2"] == pytest.approx(papers_setpoint.table_2(how))
     assert found["arithmetic"] == json.loads(json.dumps(papers_setpoint.arithmetic()))
     assert found["reward"] == pytest.approx(papers_setpoint.reward_figures(), rel=1e-5)
 
 
+def test_all_pages_tell_the_same_figures_of_one_agent():
+    """The search, the kept agent that the setpoint page shows, and the papers' page."""
+    searched = json.loads(SEARCHED.read_text(encoding="utf-8"))
+    phase_4 = results("setpoint")["agents"]["phase_4"]
+    kept = json.loads((ROOT / "datasets/papers/train_agent/figures.json").read_text(encoding="utf-8"))
+    for name in ("settled", "stay"):
+        assert phase_4["starts_70"][name] == kept["phase4"][name] == searched["kept"][name]
+        assert phase_4["starts_100"][name] == kept["phase4_at_1"][name]
+    assert results("setpoint")["search"] == searched
+
+
 def test_a_single_start_is_told_by_its_own_runs():
     class Path_:
-        flow = np.array([[200.0] * 40 + [100.0, 80.0] * 31, [200.0] * 40 + [100.0, 90.0] * 31])
-        temperature = np.full((2, 102), 210.0)
+        flow = np.array([[200.0] * 41 + [100.0, 80.0] * 30, [200.0] * 41 + [100.0, 90.0] * 30])
+        temperature = np.full((2, 101), 210.0)
         shares = np.full((2, 101, 3), 1 / 3)
 
-    told = papers_setpoint.single(Path_, slice(0, 2), shown=False)
+    told = papers_setpoint.single(Path_, shown=False)
     assert (told["least"], told["most"], told["flow_range"]) == (85.0, 100.0, 15.0)
     assert told["rests_at"] == pytest.approx(92.5, abs=0.5) and "run" not in told

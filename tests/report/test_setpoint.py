@@ -26,7 +26,7 @@ PAGE, INDEX = Path("reports/setpoint.html"), Path("reports/index.html")
 ARTIFACTS = [
     *(f"datasets/train_classifier/{name}" for name in ("classified.parquet", "reliability.parquet",
     "course.parquet", "windows.parquet", "frames/frames.json")),
-    "datasets/train_agent/agents.parquet",
+    "datasets/papers/train_agent/agents.parquet",
     *(f"datasets/evaluate_setpoint/{name}" for name in ("scoreboard.parquet", "paths.parquet",
     "decisions.parquet", "choice.json")),
 ]  # fmt: skip

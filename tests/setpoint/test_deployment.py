@@ -16,7 +16,6 @@ from pipeline.setpoint.simulation.actuation import (
     FOREIGN,
     REASONS,
     STILL,
-    TABLE,
     TIP,
     UNPROVEN,
     SetpointLimits,
@@ -243,25 +242,18 @@ def test_a_camera_that_repeats_its_reading_to_the_last_bit_stands_still():
         still(seen, np.array([91.0, 91.0001, np.nan, np.nan])), [STILL, ACTS, ACTS, ACTS]
     )
     assert REASONS[STILL] == "the picture stands still"
-    assert REASONS[TABLE] == "the camera is not the one of the table: record levels"
 
 
 @pytest.mark.parametrize(
     ("reason", "remembers"), [(ACTS, True), (UNPROVEN, False), (FEW, False), (STILL, False)]
 )
-def test_a_controller_remembers_what_is_evidence_and_is_asked_whether_the_camera_is_strange(
-    reason, remembers
-):
-    asked = SetpointController(
+def test_a_controller_remembers_the_windows_that_are_not_held(reason, remembers):
+    counts = SetpointController(
         lambda: jnp.int32(0),
         lambda parameters, memory, observation, key: (memory + 1, Action(jnp.int32(0), jnp.int32(0))),
-        lambda parameters, memory: memory >= parameters,
     )
-    key, nothing = jax.random.key(0), None
-    memory, _, after = decide(asked, 5, jnp.int32(3), nothing, jnp.int32(reason), key)
-    assert (int(memory), int(after)) == (4 if remembers else 3, reason)
-    _, _, after = decide(asked, 4, jnp.int32(3), nothing, jnp.int32(reason), key)
-    assert int(after) == (TABLE if reason == ACTS else reason)
+    memory, _ = decide(counts, (), jnp.int32(3), None, jnp.int32(reason), jax.random.key(0))
+    assert int(memory) == (4 if remembers else 3)
 
 
 def test_a_window_of_no_known_camera_is_held_and_keeps_a_reason_that_it_has():

@@ -279,7 +279,7 @@ def test_pictures_of_another_kind_are_held_and_those_of_the_known_camera_are_not
     blurred = calm(6)._replace(blur_px=np.full(6, 6.0), burst_at=np.full(6, 2), burst_for=np.full(6, 2))
     got = run(FILTERED, None, SIX, loop, blurred, decisions=4, rng=np.random.default_rng(3))
     ungated = run(FILTERED, None, SIX, CALM_LIGHT, blurred, decisions=4, rng=np.random.default_rng(3))
-    seen = actuation.is_evidence(ungated.windows.reason)
+    seen = ungated.windows.reason == ACTS
     held = got.windows.reason == actuation.FOREIGN
     assert held[:, :2].mean() <= 0.1
     assert seen[:, 2:].any() and held[:, 2:][seen[:, 2:]].all()

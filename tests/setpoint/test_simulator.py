@@ -1,4 +1,4 @@
-"""The paper's simulator and reward against their printed values and by hand, disturbances in mid-episode, and
+"""The paper's simulator and reward against their printed values and by hand, a clog in mid-episode, and
 windows drawn again from a record."""
 
 import jax
@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from pipeline.setpoint.simulation.actuation import ACTS, FEW, STILL
 from pipeline.setpoint.simulation.recorded import WindowTable, recorded_windows
 from pipeline.setpoint.simulation.simulator import (
-    CHANCES,
     FLOW_MOVES,
     GOOD,
     OVER,
@@ -18,7 +16,6 @@ from pipeline.setpoint.simulation.simulator import (
     Action,
     Observation,
     SetpointController,
-    begin,
     first_history,
     flow_class,
     nominal,
@@ -27,7 +24,6 @@ from pipeline.setpoint.simulation.simulator import (
     remembered,
     reward,
     rollout,
-    stepped,
 )
 from tests.setpoint.synthetic import synthetic_flow_table, synthetic_table
 
@@ -183,25 +179,12 @@ def test_the_same_key_gives_the_same_bytes_and_another_key_others():
 # ---- what befalls the machine
 
 
-def test_a_clog_scales_the_flow_from_its_step_on_and_a_weak_actuator_every_move():
+def test_a_clog_scales_the_flow_from_its_step_on():
     moves = standing()
     moves[12:, 0] = 4
     clogged = played(moves, machine(100.0, 210.0, clog=0.6, clog_step=10))
     np.testing.assert_allclose(clogged.flow[0, :11], [100.0] * 10 + [60.0], rtol=1e-6)
     np.testing.assert_allclose(clogged.flow[0, 13:], 60 + 6 * np.arange(1, 19), rtol=1e-6)
-    weak = played(moves, machine(100.0, 210.0, gain=0.6))
-    np.testing.assert_allclose(weak.flow[0, 12:], 100 + 6 * np.arange(19), rtol=1e-6)
-
-
-def test_drift_compounds_and_jumps_come_at_their_rate():
-    drifting = played(standing(), machine(100.0, 210.0, drift=-0.005))
-    np.testing.assert_allclose(drifting.flow[0], 100 * 0.995 ** np.arange(STEPS + 1), rtol=1e-5)
-    jumping = played(standing(), machine(100.0, 210.0, jump_rate=0.02, jump_size=0.1))
-    jumps = np.diff(np.log(jumping.flow), axis=1)
-    assert (np.abs(jumps) > 1e-6).mean() == pytest.approx(
-        0.02, abs=4 * np.sqrt(0.02 / 60_000)
-    )  # four deviations
-    assert jumps[np.abs(jumps) > 1e-6].std() == pytest.approx(0.1, rel=0.1)  # four deviations of 1,200 jumps
 
 
 # ---- recorded windows
@@ -350,14 +333,6 @@ def test_a_picture_that_comes_early_shows_the_line_of_before_the_move(wait_s, na
     assert run.named[0, 1] == named and run.named[0, 2] == OVER
 
 
-def test_a_gain_that_drifts_moves_by_what_it_is_then_and_keeps_to_its_limits():
-    moves = standing()
-    moves[:, 0] = 3
-    run = played(moves, machine(100.0, 210.0, gain=0.6, gain_drift=0.1))
-    gain = np.minimum(0.6 * 1.1 ** np.arange(STEPS), 1.2)
-    np.testing.assert_allclose(np.diff(run.flow[0]), 5 * gain, rtol=1e-4)
-
-
 def test_the_travel_of_a_minute_is_limited_as_in_the_loop_through_pixels():
     """Moves of 10 at every decision of 4 s: ten are sent, then none until the first is a minute old."""
     moves = standing()
@@ -366,74 +341,3 @@ def test_the_travel_of_a_minute_is_limited_as_in_the_loop_through_pixels():
     sent = np.diff(run.flow[0])
     np.testing.assert_allclose(sent[:15], [10.0] * 10 + [0.0] * 5, atol=1e-4)
     np.testing.assert_allclose(sent[15:25], 10.0, atol=1e-4)
-
-
-def test_clogs_come_at_their_rate_and_go_again():
-    run = played(standing(), machine(100.0, 210.0, clog=0.7, clog_rate=0.02))
-    clogged = run.flow < 99.0
-    np.testing.assert_allclose(run.flow[clogged], 70.0, rtol=1e-4)
-    np.testing.assert_allclose(run.flow[~clogged], 100.0, rtol=1e-4)
-    came = (~clogged[:, :-1] & clogged[:, 1:]).sum() / (~clogged[:, :-1]).sum()
-    went = (clogged[:, :-1] & ~clogged[:, 1:]).sum() / clogged[:, :-1].sum()
-    # four deviations of 50,000 and 10,000 decisions
-    assert came == pytest.approx(0.02, abs=0.003)
-    assert went == pytest.approx(1 / 30, abs=0.008)
-
-
-def test_nothing_is_sent_and_no_clock_runs_while_the_camera_is_blind():
-    """It moves at decision 4 and would at each blind window: nothing is sent, and no clock runs."""
-
-    def act(moves, memory, observation, key):
-        return memory, Action(
-            jnp.where((observation.step == 4) | (observation.step == 5), 4, 2), jnp.int32(2)
-        )
-
-    watcher = SetpointController(lambda: (), act)
-    conditions = machine(100.0, 210.0, blind_from=5, blind_for=4)
-    run = jax.tree.map(
-        np.asarray, rollout(watcher, (), paper_windows(), conditions, jax.random.key(0), steps=STEPS)
-    )
-    np.testing.assert_array_equal(run.reason[0], [ACTS] * 5 + [FEW] * 4 + [ACTS] * (STEPS - 9))
-    np.testing.assert_allclose(run.flow[0], [100.0] * 5 + [110.0] * 5 + [120.0] * (STEPS - 9), rtol=1e-6)
-
-
-def test_a_move_before_blind_windows_is_told_with_the_next_that_is_seen():
-    state, observation = begin(paper_windows(), _one(blind_from=1.0, blind_for=2.0), jax.random.key(0))
-    told = []
-    for index in (4, 2, 2, 2):
-        state, observation = stepped(
-            paper_windows(),
-            _one(blind_from=1.0, blind_for=2.0),
-            state,
-            Action(jnp.int32(index), jnp.int32(2)),
-            jnp.full(CHANCES, 0.5),
-        )
-        told.append(float(observation.flow_move))
-    assert told == [10.0, 10.0, 10.0, 0.0]  # 1 and 2 are blind: 3 is the first that the controller is shown
-
-
-def _one(**changes):
-    values = {name: jnp.float32(value) for name, value in changes.items()}
-    return nominal(100.0, 210.0, accuracy=1.0)._replace(**values)
-
-
-def test_a_stuck_camera_that_shows_flows_stands_still_and_nothing_is_sent():
-    table = synthetic_flow_table(np.random.default_rng(0), segments=200, windows=4)
-    moves = standing()
-    moves[:, 0] = 4
-    run = played(moves, machine(100.0, 210.0, stuck_from=3, stuck_for=6), recorded_windows(table))
-    np.testing.assert_array_equal(run.reason[:, 3:9], STILL)
-    assert (run.reason[:, :3] == ACTS).all()
-    assert (run.reason[:, 9:] == ACTS).mean() > 0.999
-    np.testing.assert_array_equal(run.flow[:, 4:10], run.flow[:, 3:4] * np.ones(6))
-
-
-def test_what_the_camera_reads_can_be_scaled_against_its_record():
-    table = synthetic_flow_table(np.random.default_rng(0), segments=400, windows=4)
-    told = [
-        played(standing(), machine(100.0, 210.0, seen=factor), recorded_windows(table)).shares
-        for factor in (1.0, 1.3)
-    ]
-    # over is N(log 1.0, 0.07^2) beyond log 1.1 with as much spread: 17 %; some 12 segments are of this bin
-    assert told[0][..., 2].mean() < 0.35
-    assert told[1][..., 2].mean() > 0.9

@@ -1,80 +1,97 @@
-"""The published agent's stage: what its memo keeps, what is swept, and what is told of the paper's claims."""
+"""The paper's agent: what is searched and how the best is chosen, what is kept of it, and what is told of the
+paper's claims."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pipeline.papers import search_agent, train_agent
+from pipeline.papers.search_agent import SearchedRun, TrainAgent, training
 from pipeline.setpoint.agents import agent, claims
-from pipeline.setpoint.agents.agent import PublishedAgent, QNetwork
-from pipeline.setpoint.simulation.simulator import (
-    Action,
-    SetpointController,
-    Trajectory,
-    nominal,
-    paper_windows,
-    rollout,
-)
+from pipeline.setpoint.agents.agent import Checkpoint, QNetwork
+from pipeline.setpoint.simulation.simulator import Trajectory
 from pipeline.store import params
-from stages import train_agent
-from stages.train_agent import TrainAgent
+
+CHOSEN = {"explore": [1.0, 0.3, 0.3, 0.3], "environments": 4, "rate_at_end": 0.5}
+SMALL = {"updates": [5, 5, 5, 32], "batch": 16, "capacity": 1000, "episode": 10}
 
 
 @pytest.fixture
 def settings(root) -> TrainAgent:
-    declared = params.load(TrainAgent, "train_agent", root / params.FILE)
-    small = {"updates": [5, 5, 5, 5], "environments": 4, "batch": 16, "capacity": 1000, "episode": 10}
-    return declared.model_copy(update={"li_2025": declared.li_2025.model_copy(update=small)})
+    declared = params.load(TrainAgent, "train_agent", root / params.PAPERS)
+    return declared.model_copy(update=SMALL)
 
 
-def of(settings: TrainAgent, **changes) -> TrainAgent:
-    return settings.model_copy(update={"li_2025": settings.li_2025.model_copy(update=changes)})
-
-
-def test_history_and_lambda_are_swept(settings):
-    """Eta is the width of the network's camera input; lambda is the clock by which targets move."""
-    swept = of(settings, history=7, flow_actions=4)
-    trained = train_agent.published_agent(swept, None, lambda *_: None)
-    assert [network.vision.in_features for network in trained.networks] == [7 + 3] * 4
-    assert {agent.history_of(network) for network in trained.networks} == {7}
-    conditions = nominal(np.full(2, 100.0), 190.0, accuracy=1.0)._replace(flow_actions=jnp.full(2, 4.0))
-    up = SetpointController(lambda: (), lambda p, m, o, key: (m, Action(jnp.int32(2), jnp.int32(3))))
-    path = rollout(up, (), paper_windows(), conditions, jax.random.key(0), steps=10)
-    np.testing.assert_array_equal(np.flatnonzero(np.diff(path.target[0])), [0, 4, 8])
-    told = train_agent.paper_claims(swept, trained.networks)
+def test_the_history_is_the_width_of_the_network_s_camera_input(settings):
+    how = training(settings.model_copy(update={"history": 7}), CHOSEN)
+    assert (how.dqn.environments, how.rate_at_end, how.updates) == (4, 0.5, (5, 5, 5, 32))
+    networks = agent.train_published(jax.random.key(0), how).networks
+    assert [network.vision.in_features for network in networks] == [7 + 3] * 4
+    assert {agent.history_of(network) for network in networks} == {7}
+    told = claims.compare_starts(networks, accuracy=0.7)
     assert told["300 %, 230 °C"]["printed"] == {"rests_at": 95.0, "least": 75.0, "most": 130.0}
     assert all(np.isfinite(claim["measured"]["rests_at"]) for claim in told.values())
 
 
-def test_the_published_agent_is_trained_once_for_all_windows(settings, tmp_path, monkeypatch):
-    calls = []
+def test_a_searched_run_is_the_best_checkpoint_that_the_kept_agent_is_trained_to(
+    settings, root, tmp_path, monkeypatch
+):
+    """The search trains phases 1 to 3 once for all settings; the kept agent is trained from the beginning."""
+    monkeypatch.setattr(search_agent, "MEMO", tmp_path)
+    monkeypatch.setattr(search_agent, "LOOP", root / "pipeline/setpoint")
+    judged, checkpoints = [], []
 
-    def train(key, how, *, on_step):
-        calls.append(how)
-        network = QNetwork(key, how.history)
-        return PublishedAgent((network,) * 4, (jnp.arange(5.0),) * 4)
+    def run_starts(network, *, accuracy):
+        judged.append(network)
+        return Trajectory(np.full((1, 201), 100.0), np.full((1, 201), 210.0), *[None] * 4)
 
-    monkeypatch.setattr(agent, "train_published", train)
-    first = train_agent.published_agent(settings, tmp_path, print)
-    again = train_agent.published_agent(settings, tmp_path, print)
-    assert len(calls) == 1
-    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
-        np.testing.assert_array_equal(a, b)
-    # other settings, another seed and other code are trained; a damaged entry is trained again
-    train_agent.published_agent(of(settings, history=9), tmp_path, print)
-    train_agent.published_agent(settings.model_copy(update={"seed": 5}), tmp_path, print)
-    assert len(calls) == 3
-    monkeypatch.setattr(train_agent, "PUBLISHED_CODE", ("agents/agent.py",))
-    train_agent.published_agent(settings, tmp_path, print)
-    assert len(calls) == 4
-    for path in tmp_path.glob("*.safetensors"):
-        path.write_bytes(path.read_bytes()[:500])
-    train_agent.published_agent(settings, tmp_path, print)
-    train_agent.published_agent(settings, tmp_path, print)
-    assert len(calls) == 5
+    def best(result, key, how):
+        network = jax.tree.map(lambda leaf: leaf[3], result.checkpoints)
+        checkpoints.append(network)
+        return Checkpoint(network, 4, 70.0, 60.0)
+
+    monkeypatch.setattr(agent, "run_starts", run_starts)
+    monkeypatch.setattr(agent, "best_checkpoint", best)
+    run = search_agent.searched_run(settings, CHOSEN, 1)
+    assert run == SearchedRun(8, 70.0, 60.0, 100.0, 100.0, 100.0, 100.0)  # 4 of 16 parts of 32 updates
+    published = agent.train_published(search_agent.first_key(1), training(settings, CHOSEN))
+    for found, kept in zip(*map(jax.tree.leaves, (judged[0], published.networks[-1])), strict=True):
+        np.testing.assert_array_equal(found, kept)
+    # what was searched is remembered; other settings and another seed are not
+    assert search_agent.searched_run(settings, CHOSEN, 1) == run and len(checkpoints) == 2
+    search_agent.searched_run(settings, CHOSEN | {"rate_at_end": 1.0}, 1)
+    search_agent.searched_run(settings, CHOSEN, 2)
+    assert len(checkpoints) == 4
 
 
-def test_a_start_is_told_as_the_paper_tells_it(settings, monkeypatch):
+def test_validation_alone_chooses_setting_and_seed(settings, monkeypatch):
+    """Every judged figure is better where validation is worse: it must choose nothing."""
+
+    def found(settings, chosen, seed):
+        validated = (
+            50.0 + 10.0 * (chosen["environments"] == 32) + (seed == 2) - (chosen["rate_at_end"] == 1.0)
+        )
+        validated += 20.0 * (chosen["explore"][-1] == 0.3)
+        return SearchedRun(seed, 0.0, validated, 0.0, 100.0 - validated, 0.0, 0.0)
+
+    monkeypatch.setattr(search_agent, "searched_run", found)
+    told = search_agent.search(settings)
+    assert told["best"] == {"explore": [1.0, 0.3, 0.3, 0.3], "environments": 32, "rate_at_end": 0.05}
+    assert (told["seed"], told["kept"]["updates"], told["kept"]["validated_stay"]) == (2, 2, 81.0)
+    assert (told["settings"], told["seeds"], len(told["rows"])) == (8, 3, 8)
+    assert (told["stay_min"], told["stay_max"], told["best_stay_min"]) == (19.0, 51.0, 19.0)
+
+
+def test_the_learning_curve_has_as_many_stretches_of_each_phase():
+    rewards = (jnp.arange(100.0), jnp.ones(50))
+    curve = train_agent.learning_curve(agent.PublishedAgent((), rewards))
+    assert curve["phase"] == [1] * 50 + [2] * 50 and set(curve["agent"]) == {"li_2025"}
+    assert (curve["update"][:2], curve["update"][-1]) == ([2, 4], 150)
+    assert (curve["reward"][:2], curve["reward"][-1]) == ([0.5, 2.5], 1.0)
+
+
+def test_a_start_is_told_as_the_paper_tells_it(monkeypatch):
     """By hand: one run crosses 100 %, falls to 75, rises to 130 and rests at 95; it is cold for a while."""
     q = np.array([300, 200, 105, 75, 130, 95, 95, 95, 95, 95, 95.0])
     u = np.array([230, 220, 210, 200, 200, 205, 210, 210, 210, 210, 210.0])
@@ -88,15 +105,19 @@ def test_a_start_is_told_as_the_paper_tells_it(settings, monkeypatch):
     monkeypatch.setattr(claims, "rollout", path)
     monkeypatch.setattr(claims, "RESTING", 4)
     networks = [QNetwork(jax.random.key(0))] * 4
-    told = train_agent.paper_claims(settings, networks)["300 %, 230 °C"]["measured"]
-    assert told == {"rests_at": 95, "least": 75, "most": 130, "flow_range": 0, "temperature_range": 5}
+
+    def claimed():
+        told = claims.compare_starts(networks, accuracy=0.7)
+        return told["300 %, 230 °C"]["measured"]
+
+    assert claimed() == {"rests_at": 95, "least": 75, "most": 130, "flow_range": 0, "temperature_range": 5}
     assert started[0] == (300.0, pytest.approx(0.7))
     q[2:] = 200
-    assert train_agent.paper_claims(settings, networks)["300 %, 230 °C"]["measured"]["most"] is None
+    assert claimed()["most"] is None
 
 
 def test_what_the_paper_does_not_print_is_named(settings):
-    told = train_agent.guesses(of(settings, updates=[9, 8, 7]).li_2025)
+    told = train_agent.guesses(training(settings.model_copy(update={"updates": [9, 8, 7, 6]}), CHOSEN))
     assert (told["delta"], told["alpha"], told["sigma"]) == (5.0, 1.5, 0.15)
-    assert told["updates_by_phase"] == [9, 8, 7]
-    assert told["explore_by_phase"] == [1.0, 0.3, 0.3]
+    assert told["updates_by_phase"] == [9, 8, 7, 6]
+    assert told["explore_by_phase"] == [1.0, 0.3, 0.3, 0.3]

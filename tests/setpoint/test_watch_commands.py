@@ -88,7 +88,7 @@ def make() -> None:
     }
     artifacts.write_table(folder / "windows.parquet", WINDOWS, window_rows(tables))
     networks = tuple(QNetwork(key) for key in jax.random.split(jax.random.key(3), 4))
-    store_published(Path("datasets/train_agent/weights.safetensors"), networks)
+    store_published(Path("datasets/papers/train_agent/weights.safetensors"), networks)
     artifacts.write_json("datasets/evaluate_setpoint/choice.json", {"name": "Bayes filter"})
 
 

@@ -30,11 +30,11 @@ def test_equal_arrays_give_equal_bytes_in_whatever_order_they_come(tmp_path):
     [
         (
             lambda path: path.unlink(),
-            "weights.safetensors is missing; make it again with ./run dvc repro train_agent",
+            "weights.safetensors is missing; make it again with ./run dvc repro train_classifier",
         ),
         (
             lambda path: path.write_bytes(path.read_bytes()[:-5]),
-            "holds no whole weights .*; make it again with ./run dvc repro train_agent",
+            "holds no whole weights .*; make it again with ./run dvc repro train_classifier",
         ),
         (
             lambda path: write_weights(path, "classifier 1", ARRAYS, {}),
@@ -44,7 +44,7 @@ def test_equal_arrays_give_equal_bytes_in_whatever_order_they_come(tmp_path):
 )
 def test_what_is_not_whole_or_of_another_learner_is_one_sentence(tmp_path, monkeypatch, change, sentence):
     monkeypatch.chdir(tmp_path)
-    path = tmp_path / "datasets/train_agent/weights.safetensors"
+    path = tmp_path / "datasets/train_classifier/weights.safetensors"
     write_weights(path, "agent 1", ARRAYS, {})
     change(path)
     with pytest.raises(ValueError, match=sentence):

@@ -17,7 +17,7 @@ STAGES = {
         "evaluate_temperature",
     ),
     "deposition": ("train_ilc", "segment_library", "compose_parts"),
-    "setpoint": ("train_classifier", "train_agent", "evaluate_setpoint"),
+    "setpoint": ("train_classifier", "evaluate_setpoint"),
 }  # fmt: skip
 
 

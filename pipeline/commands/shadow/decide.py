@@ -21,7 +21,7 @@ from pipeline.setpoint.material import PLA, PrintedMaterial
 from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
 from pipeline.setpoint.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.setpoint.simulation import actuation
-from pipeline.setpoint.simulation.actuation import ACTS, FOREIGN, SetpointLimits, is_evidence
+from pipeline.setpoint.simulation.actuation import ACTS, FOREIGN, SetpointLimits
 from pipeline.setpoint.simulation.simulator import Observation, SetpointController
 from pipeline.setpoint.vision.calibrated_classifier import CalibratedClassifier, FrameReadings, read_frames
 from pipeline.setpoint.vision.proof import CameraProof
@@ -151,7 +151,7 @@ class Mind:
         material = self.deployed.material
         seen_at = material.published_temperature(temperature)
         judged = self._judged(areas, seen_at, self._tip_moved(window, tips, notes), notes)
-        judged, would = self._answer(judged, setpoint, float(seen_at.mean()), notes)
+        would = self._answer(judged, setpoint, float(seen_at.mean()), notes)
         judged = _own(judged, material)
         self.number += 1
         time_s = window[-1].time_s - first_s
@@ -193,12 +193,12 @@ class Mind:
 
     def _answer(
         self, judged: JudgedWindow, setpoint: tuple[float, float], temperature: float, notes: list[str]
-    ) -> tuple[JudgedWindow, np.ndarray]:
-        """(2,) the change of flow in percent and target in degC that would be sent, within the limits; and
-        the window with the reason that the controller adds. Setpoint and change are of the material that is
-        printed, window and temperature of the published one."""
-        if not is_evidence(judged.reason[0]):
-            return judged, np.zeros(2)
+    ) -> np.ndarray:
+        """(2,) the change of flow in percent and target in degC that would be sent, within the limits, 0 if
+        the window is held. Setpoint and change are of the material that is printed, window and temperature of
+        the published one."""
+        if judged.reason[0] != ACTS:
+            return np.zeros(2)
         material = self.deployed.material
         published = _published(material, setpoint)
         move = published[0] - self.shown_flow if np.isfinite(self.shown_flow) else 0.0
@@ -212,7 +212,7 @@ class Mind:
             target=jnp.float32(published[1]),
             step=jnp.int32(self.acted),
         )
-        self.memory, action, reason = self.decide_jit(
+        self.memory, action = self.decide_jit(
             self.deployed.controller,
             self.deployed.parameters,
             self.memory,
@@ -220,9 +220,6 @@ class Mind:
             jnp.int32(judged.reason[0]),
             jax.random.fold_in(self.key, self.number),
         )
-        judged = judged._replace(reason=np.array([int(reason)]))
-        if judged.reason[0] != ACTS:
-            return judged, np.zeros(2)
         heats = self.acted % LAMBDA == 0
         wanted = np.array(
             [FLOW_MOVES[int(action.flow)], TEMPERATURE_MOVES[int(action.temperature)] if heats else 0.0]
@@ -236,7 +233,7 @@ class Mind:
             )
         at = actuation.setpoints(inside[None], limits)
         after = actuation.moved(at, wanted[None], np.zeros(1), limits).value[0]
-        return judged, _own_setpoint(material, after) - _own_setpoint(material, inside)
+        return _own_setpoint(material, after) - _own_setpoint(material, inside)
 
     def _tip_moved(self, window: list[CameraFrame], tips: np.ndarray, notes: list[str]) -> bool:
         """Whether the nozzle is elsewhere than on the first frame of the watch."""

@@ -63,7 +63,7 @@ def ready(levels_file: str | None) -> Ready:
     name = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
     table = artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS)
     windows = window_tables(table, WINDOW_PARTS)
-    agents = restore_published("datasets/train_agent/weights.safetensors")
+    agents = restore_published("datasets/papers/train_agent/weights.safetensors")
     learn = windows["learn"]
     flow = partial(window_flow, fitted=model.calibration.flow)
     proof = model.calibration.proof

@@ -19,6 +19,8 @@ from pipeline.verdict.verdict import Missing
 
 # glyph of a verdict, by the states that the pages know
 GLYPHS = {HOLDS: "passed", SHAPE: "passed", FAILS: "failed", OPEN: "open"}
+# what else the second pipeline makes for a paper's results; told if it is older than its method
+PARTS = {"setpoint": ("search_agent", "train_agent", "camera")}
 PICTURES = {
     "temperature": temperature.pictures,
     "deposition": deposition.pictures,
@@ -44,7 +46,9 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
                 "rows": paper.rows,
                 "pictures": pictures,
                 "files": (printed, results),
-                "made": made.sentence(key),
+                "made": " ".join(
+                    made.sentence(one) for one in (key, *filter(made.changed, PARTS.get(key, ())))
+                ),
             }
         )
     papers = [one["paper"] for one in shown]

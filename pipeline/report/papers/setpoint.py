@@ -23,8 +23,8 @@ def pictures(results: Mapping[str, Any], sources: Sources) -> list[PaperFigure]:
     six, three = (number(wait, 0) for wait in sorted(settings["waits_s"], reverse=True))
     view = number(settings["view_s"], 0)
     waits = (
-        f"Solid: {six} s. Dashed: {three} s. Simulated: {view} s after a move the picture shows only what "
-        "was laid since."
+        f"Solid: {six} s. Dashed: {three} s. Simulated, {right}: {view} s after a move the picture shows "
+        "only what was laid since."
     )
     example = agents["phase_3"]["figure_3_100"]["run"]
     return [
@@ -173,7 +173,7 @@ def _waits(of: Mapping[str, Any]) -> Markup:
     return plot(
         [PaperCurve(steps, three["flow"], "line dash"), PaperCurve(steps, six["flow"], "line")],
         title="flow in %, against steps",
-        alt=f"Median steps to the band: {number(three['steps'], 0)} with the short wait, "
+        alt=f"Mean steps to the band: {number(three['steps'], 0)} with the short wait, "
         f"{number(six['steps'], 0)} with the long one",
         levels=[(100.0, "")],
     )

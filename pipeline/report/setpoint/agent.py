@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
+from pipeline.papers import made
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
@@ -24,7 +25,7 @@ FLOW, TEMPERATURE = charts.linear(0, 320, ticks=6), charts.linear(180, 240, tick
 # starts that a panel has room for
 MOST = 42
 CASES = (("recorded", "recorded, sticky"), ("paper", "accuracy 0.7"))
-# key of train_agent.json -> who, after what
+# key of the agent's figures -> who, after what
 TAUGHT = {
     "phase3": ("The paper’s agent", "phases 1 to 3, judged with classes that are always right"),
     "phase3_at_0.7": ("The paper’s agent", f"phases 1 to 3, judged with 70{THIN}% right"),
@@ -256,6 +257,13 @@ def _course(mine: pd.DataFrame, reward_text: str) -> Markup:
     )
 
 
+def kept_sentence() -> str:
+    """Since when the agent is kept, and how it is trained anew."""
+    kept, command = made.sentence("train_agent"), made.command("train_agent")
+    anew = "" if command in kept else f" {command} trains it anew."
+    return f"All pages show one agent, which no recording changes. {kept}{anew}"
+
+
 def phases(sources: Sources) -> dict[str, Any]:
     """What training came to: settled, staying and steps, by what was trained."""
     metrics = sources.metrics["train_agent"]
@@ -278,7 +286,7 @@ def phases(sources: Sources) -> dict[str, Any]:
                 "runs": "not said" if isinstance(runs, Missing) else f"{runs:,}",
             }
         )
-    gap = None if rows else Missing("not measured", "train_agent.json holds no run")
+    gap = None if rows else Missing("not measured", "figures.json of train_agent holds no run")
     return {"missing": gap, "rows": rows}
 
 

@@ -62,7 +62,7 @@ WORDS = (
     "reward",
     "accepted",
 )
-SECTIONS = ("setpoint_material", "train_classifier", "train_agent", "evaluate_setpoint")
+SECTIONS = ("setpoint_material", "train_classifier", "evaluate_setpoint")
 MOST = 12
 GOOD = 1  # of the classes under, good, over
 LANES = {"data_driven": "dd", "model_based": "mb", "baseline": "acc"}
@@ -109,6 +109,7 @@ def render(sources: Sources) -> str:
         claims=[] if isinstance(claimed, Missing) else claimed,
         claims_missing=claimed if isinstance(claimed, Missing) else None,
         guesses=setpoint_agent.guesses(sources),
+        agent_made=setpoint_agent.kept_sentence(),
         good_named=good_named(sources),
         by_flow=setpoint_by_flow.by_flow(sources),
         yardsticks=setpoint_vision.yardsticks(sources),

@@ -363,9 +363,9 @@ def _read(
     read: dict[str, SourceFile], path: str, name: str, stage: str, schema: str, reader: Callable[[str], Any]
 ) -> Any:
     if not artifacts.exists(path):
-        return Missing(
-            "not measured", f"{Path(path).name} of {stage} is not there", f"Run ./run dvc repro {stage}"
-        )
+        kept = Path(path).parts[1] == "papers"
+        remedy = "git checkout datasets/papers" if kept else f"./run dvc repro {stage}"
+        return Missing("not measured", f"{Path(path).name} of {stage} is not there", f"Run {remedy}")
     try:
         content = reader(path)
     except ValueError as error:

@@ -17,6 +17,7 @@ import optax
 from jax.tree_util import Partial
 
 from pipeline.setpoint.agents import trials
+from pipeline.setpoint.agents.criteria import STEPS
 from pipeline.setpoint.published import BEST_TEMPERATURE, LAMBDA, PHASES
 from pipeline.setpoint.simulation.simulator import (
     CHANCES,
@@ -30,6 +31,7 @@ from pipeline.setpoint.simulation.simulator import (
     MachineState,
     Observation,
     SetpointController,
+    Trajectory,
     WindowSource,
     begin,
     first_history,
@@ -38,6 +40,7 @@ from pipeline.setpoint.simulation.simulator import (
     paper_windows,
     remembered,
     reward,
+    rollout,
     stepped,
 )
 
@@ -46,6 +49,7 @@ ACTIONS = 5  # of each head
 # cache (288 numbers in 32 kB)
 SHORT = 256
 VALIDATION_RUNS = 20  # from each of the 21 starts, to choose a checkpoint by
+RUNS, JUDGED_SEED = 100, 1000  # from each of them, to judge an agent by; and the seed of those runs' chances
 CHECKPOINTS = 16  # of a phase: the network after each of so many equal parts
 TEMPERATURE_SCALE = 30.0  # °C, half the range of the targets: degrees as they come drown the camera's numbers
 
@@ -102,6 +106,7 @@ def paper_encoder(history: int = HISTORY) -> ObservationEncoder:
     return ObservationEncoder(Partial(first_history, history), Partial(encode))
 
 
+@cache  # one controller for all networks, so that what was compiled for it is found again
 def greedy(encoder: ObservationEncoder) -> SetpointController:
     """The controller that takes the best action of each head; its parameters are the network. The simulator
     heeds the temperature's every 10th step."""
@@ -209,14 +214,14 @@ def _stepped(problem: DqnProblem, network, episodes, epsilon, u: jax.Array, key)
     explores, at_random, befalls = u[:, :2] < epsilon, (ACTIONS * u[:, 2:4]).astype(jnp.int32), u[:, 4:]
     action = jnp.where(explores, at_random, jax.vmap(network)(x).argmax(axis=2))
     action = action.at[:, 1].set(
-        jnp.where(state.step % conditions.flow_actions == 0, action[:, 1], STAND)
+        jnp.where(state.step % LAMBDA == 0, action[:, 1], STAND)
     )  # what is not heeded is standing
     state, observation = jax.vmap(Partial(stepped, env.windows))(
         conditions, state, Action(action[:, 0], action[:, 1]), befalls
     )
     memory, after = jax.vmap(Partial(problem.encoder.encode, network))(memory, observation)
     rewards = jax.vmap(env.rewards)(state)
-    over, masked = state.step >= problem.settings.episode, state.step % conditions.flow_actions != 0
+    over, masked = state.step >= problem.settings.episode, state.step % LAMBDA != 0
 
     def renewed(going):
         again = _fresh(problem, network, jax.random.split(key, len(x)))
@@ -294,8 +299,7 @@ def _phase(train_state: DqnState, key, problem: DqnProblem, updates, epsilon, *,
     k_start, k_clock, key = jax.random.split(key, 3)
     n, capacity = settings.environments, settings.capacity
     conditions, state, memory, x = _fresh(problem, train_state.network, jax.random.split(k_start, n))
-    actions = conditions.flow_actions.astype(jnp.int32)
-    state = state._replace(step=actions * jax.random.randint(k_clock, (n,), 0, settings.episode // actions))
+    state = state._replace(step=LAMBDA * jax.random.randint(k_clock, (n,), 0, settings.episode // LAMBDA))
     # a step draws some thousand numbers: by XLA's own generator
     # (Philox), which costs a tenth of jax's default there
     fast = jax.random.wrap_key_data(jnp.tile(jax.random.key_data(key), 2), impl="rbg")
@@ -341,21 +345,19 @@ def ellipse(a, b, state: MachineState) -> jax.Array:
     return jnp.tile(reward(state.flow, state.temperature, a=a, b=b), 2)
 
 
-def anywhere(accuracy, key: jax.Array, *, flow_actions=LAMBDA) -> EpisodeConditions:
-    """A machine that does as it is told, from a flow and temperature uniform within the limits; flow_actions
-    to one temperature action."""
+def anywhere(accuracy, key: jax.Array) -> EpisodeConditions:
+    """A machine that does as it is told, from a flow and temperature uniform within the limits."""
     u = jax.random.uniform(key, (2,))
     low, high = jnp.array([FLOW_LIMITS, TEMPERATURE_LIMITS]).T
     flow, temperature = low + (high - low) * u
-    conditions = nominal(flow, temperature, accuracy=accuracy)
-    return conditions._replace(flow_actions=flow_actions * jnp.ones_like(flow))
+    return nominal(flow, temperature, accuracy=accuracy)
 
 
 class PublishedTraining(NamedTuple):
     """`updates` of each phase, as many phases as there are numbers; accuracy of the windows in the last one.
 
-    Epsilon falls from `explore` of each phase to `least`. history is eta of (8), flow_actions is lambda,
-    table 2. The learning rate of phase 4 falls in a line to the share `rate_at_end`, 1 if it does not fall.
+    Epsilon falls from `explore` of each phase to `least`. history is eta of (8). The learning rate of phase 4
+    falls in a line to the share `rate_at_end`, 1 if it does not fall.
     """
 
     dqn: DqnSettings
@@ -366,15 +368,11 @@ class PublishedTraining(NamedTuple):
     least: float
     rate_at_end: float = 1.0
     history: int = HISTORY
-    flow_actions: int = LAMBDA
 
 
-def train_published(key: jax.Array, settings: PublishedTraining, *, on_step=None) -> PublishedAgent:
+def train_published(key: jax.Array, settings: PublishedTraining) -> PublishedAgent:
     """The four phases: reward shapes (40, 20), (40, 10), (20, 10) on windows that are always right, then the
-    last shape with `accuracy`; Adam. Of the fourth phase the best checkpoint is kept.
-
-    on_step(phase, network, rewards) is called after each phase.
-    """
+    last shape with `accuracy`; Adam. Of the fourth phase the best checkpoint is kept."""
     train_state, key = begin_published(key, settings)
     networks, all_rewards = [], []
     for i in range(len(settings.updates)):
@@ -383,8 +381,6 @@ def train_published(key: jax.Array, settings: PublishedTraining, *, on_step=None
         network = train_state.network if i < len(PHASES) else best_checkpoint(result, key, settings).network
         networks.append(network)
         all_rewards.append(result.rewards)
-        if on_step is not None:
-            on_step(i + 1, network, result.rewards)
     return PublishedAgent(tuple(networks), tuple(all_rewards))
 
 
@@ -411,7 +407,7 @@ def published_phase(
     a, b = PHASES[min(i, len(PHASES) - 1)]
     last = i == len(PHASES)
     right, before = settings.accuracy if last else 1.0, sum(settings.updates[:i])
-    start = Partial(anywhere, jnp.asarray(right), flow_actions=jnp.float32(settings.flow_actions))
+    start = Partial(anywhere, jnp.asarray(right))
     env = EnvSpec(paper_windows(), start, Partial(ellipse, jnp.asarray(a), jnp.asarray(b)))
     falls = (settings.rate_at_end, settings.updates[i], before) if last else ()
     return phase(
@@ -443,14 +439,19 @@ class Checkpoint(NamedTuple):
 def best_checkpoint(result: PhaseResult, key: jax.Array, settings: PublishedTraining) -> Checkpoint:
     """Of a phase's checkpoints the one of which most validation runs stay; of equal ones the last."""
     conditions = trials.starts(VALIDATION_RUNS, accuracy=settings.accuracy)
-    conditions = conditions._replace(flow_actions=settings.flow_actions * jnp.ones_like(conditions.flow))
-    controller, key = greedy(paper_encoder(settings.history)), jax.random.fold_in(key, 100)
-    found = []
+    key, found = jax.random.fold_in(key, 100), []
     for k in range(CHECKPOINTS):
-        network = jax.tree.map(lambda leaf, k=k: leaf[k], result.checkpoints)
-        told = trials.evaluate(controller, network, paper_windows(), conditions, key)
+        network: QNetwork = jax.tree.map(lambda leaf, k=k: leaf[k], result.checkpoints)
+        told = trials.evaluate(published(network), network, paper_windows(), conditions, key)
         found.append(Checkpoint(network, k + 1, told.settled.percent, told.stay.percent))
     return max(found, key=lambda one: (one.stay, one.settled, one.after))
+
+
+def run_starts(network: QNetwork, *, accuracy: float) -> Trajectory:
+    """RUNS from each of the 21 starts, on draws that neither training nor validation saw: what every page
+    tells of an agent on the paper's simulator is told of these."""
+    key, conditions = jax.random.key(JUDGED_SEED), trials.starts(RUNS, accuracy=accuracy)
+    return rollout(published(network), network, paper_windows(), conditions, key, steps=STEPS)
 
 
 # ---- weights by name
@@ -494,9 +495,9 @@ def with_weights(network: eqx.Module, arrays: dict[str, np.ndarray]) -> eqx.Modu
 # ---- rows of controllers.CONTROLLERS: settings, agents and recorded windows -> controller and parameters
 
 
-@cache  # one controller for all phases, so that what was compiled for it is found again
-def _published(history: int) -> SetpointController:
-    return greedy(paper_encoder(history))
+def published(network: QNetwork) -> SetpointController:
+    """The controller of the paper's agent, whose parameters are this network."""
+    return greedy(paper_encoder(history_of(network)))
 
 
 def build(
@@ -504,4 +505,4 @@ def build(
 ) -> tuple[SetpointController, QNetwork]:
     """The agent of Li and Pattinson (2025) after the last of its phases that was trained."""
     network = agents.networks[-1]
-    return _published(history_of(network)), network
+    return published(network), network

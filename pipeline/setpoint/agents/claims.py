@@ -4,49 +4,40 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from pipeline.setpoint.agents import agent, trials
-from pipeline.setpoint.agents.score import RunScore
-from pipeline.setpoint.simulation.simulator import nominal, paper_windows, rollout
+from pipeline.setpoint.agents import agent
+from pipeline.setpoint.agents.agent import JUDGED_SEED, RUNS, run_starts
+from pipeline.setpoint.agents.score import judge
+from pipeline.setpoint.simulation.simulator import Trajectory, nominal, paper_windows, rollout
 
-# runs from each single start, and decisions at the end over which a run has come to rest
-CLAIM_RUNS, RESTING = 100, 20
+# decisions of a run from a single start, and those at its end over which it has come to rest
+SHOWN, RESTING = 100, 20
 
 
-def simulated_figures(
-    networks: Sequence[agent.QNetwork], key: jax.Array, runs: int, history: int, flow_actions: int
-) -> dict[str, dict[str, Any]]:
-    """Figures of the networks after three phases and after the last, from the 21 starts, `runs` times each,
-    with the class always right and right with probability 0.7."""
-    right, noisy = (trials.starts(runs, accuracy=accuracy) for accuracy in (1.0, 0.7))
-    published = agent.greedy(agent.paper_encoder(history))
-    cases = {"phase3": (networks[2], right)}
-    if len(networks) > 3:
-        cases |= {"phase4": (networks[3], noisy), "phase4_at_1": (networks[3], right)}
-    cases |= {"phase3_at_0.7": (networks[2], noisy)}
-    simulated = {
-        name: (published, network, starts._replace(flow_actions=flow_actions * jnp.ones_like(starts.flow)))
-        for name, (network, starts) in cases.items()
-    }
+def simulated_figures(networks: Sequence[agent.QNetwork]) -> dict[str, dict[str, Any]]:
+    """Figures of the networks after three phases and after the last, from the 21 starts, with the class
+    always right and right with probability 0.7."""
+    cases = {"phase3": (2, 1.0), "phase4": (3, 0.7), "phase4_at_1": (3, 1.0), "phase3_at_0.7": (2, 0.7)}
     return {
-        name: _figures(trials.evaluate(controller, network, paper_windows(), conditions, key))
-        for name, (controller, network, conditions) in simulated.items()
+        name: _figures(run_starts(networks[i], accuracy=accuracy))
+        for name, (i, accuracy) in cases.items()
+        if i < len(networks)
     }
 
 
-def compare_starts(
-    networks: Sequence[agent.QNetwork],
-    key: jax.Array,
-    *,
-    accuracy: float,
-    history: int,
-    flow_actions: int,
-    steps: int,
-) -> dict[str, dict[str, Any]]:
+def run_start(network: agent.QNetwork, flow: float, temperature: float, *, accuracy: float) -> Trajectory:
+    """RUNS of SHOWN decisions from one start in percent and °C, on the draws of `run_starts`' seed."""
+    key, conditions = (
+        jax.random.key(JUDGED_SEED),
+        nominal(np.full(RUNS, flow), temperature, accuracy=accuracy),
+    )
+    return rollout(agent.published(network), network, paper_windows(), conditions, key, steps=SHOWN)
+
+
+def compare_starts(networks: Sequence[agent.QNetwork], *, accuracy: float) -> dict[str, dict[str, Any]]:
     """What Li and Pattinson (2025) print of single starts (sections 3.3 and 3.4, figures 7 and 8), beside
-    what CLAIM_RUNS runs of ours come to: medians, in percent of flow and °C. `accuracy` is the last phase's.
+    what RUNS runs of ours come to: medians, in percent of flow and °C. `accuracy` is the last phase's.
 
     rests_at: mean flow of the last decisions; least and most: of the flow after it first came within 10 % of
     100 %; flow_range and temperature_range: from least to most over the second half of the run.
@@ -63,12 +54,9 @@ def compare_starts(
             (3, {"flow_range": 0.0, "temperature_range": 0.0}),
         )
     }
-    controller, n = agent.greedy(agent.paper_encoder(history)), CLAIM_RUNS
     compared = {}
     for name, (claim, network, flow, temperature, right) in printed.items():
-        conditions = nominal(np.full(n, flow), temperature, accuracy=right)
-        conditions = conditions._replace(flow_actions=flow_actions * jnp.ones(n))
-        path = rollout(controller, network, paper_windows(), conditions, key, steps=steps)
+        path = run_start(network, flow, temperature, accuracy=right)
         compared[name] = {
             "printed": claim,
             "measured": measure_runs(np.asarray(path.flow, float), np.asarray(path.temperature, float)),
@@ -99,7 +87,8 @@ def parameters(network: Any) -> int:
     return sum(np.size(leaf) for leaf in jax.tree.leaves(network))
 
 
-def _figures(score: RunScore) -> dict[str, Any]:
+def _figures(path: Trajectory) -> dict[str, Any]:
+    score = judge(np.asarray(path.flow), np.asarray(path.temperature))
     steps = {
         name: float(value) if np.isfinite(value) else None
         for name, value in (("median_steps", score.median_steps), ("p90_steps", score.p90_steps))

@@ -1,11 +1,10 @@
-"""What train_agent leaves: the networks of Li and Pattinson (2025) after each phase, to one file and back."""
+"""What train_agent of the second pipeline leaves: the networks of Li and Pattinson (2025) after each phase,
+to one file and back."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from pipeline.setpoint.agents import agent
@@ -17,22 +16,20 @@ from pipeline.store.artifacts import read_weights, write_weights
 PUBLISHED_SCHEMA = "published agent 1"
 
 
-def store_published(path: Path, networks: Sequence[QNetwork], rewards: Sequence[jax.Array] = ()) -> None:
-    """The networks of Li and Pattinson (2025) after each phase, and for a memo the rewards of its steps."""
+def store_published(path: Path, networks: Sequence[QNetwork]) -> None:
+    """The networks of Li and Pattinson (2025) after each phase."""
     arrays = {
         f"phase{i + 1}.{name}": a for i, n in enumerate(networks) for name, a in agent.weights(n).items()
     }
-    arrays |= {f"phase{i + 1}.rewards": np.asarray(r) for i, r in enumerate(rewards)}
     write_weights(path, PUBLISHED_SCHEMA, arrays, {"phases": str(len(networks))})
 
 
 def restore_published(path: Path | str) -> agent.PublishedAgent:
-    """What `store_published` wrote; no rewards if none were stored. Raises ValueError if the file is none."""
+    """What `store_published` wrote, without rewards. Raises ValueError if the file is none."""
     arrays, about = read_weights(path, PUBLISHED_SCHEMA)
     with artifacts.about(path):
         parts = [_part(arrays, f"phase{i + 1}") for i in range(int(about["phases"]))]
-        rewards = tuple(jnp.asarray(part.pop("rewards")) for part in parts if "rewards" in part)
-        return agent.PublishedAgent(tuple(_network(part) for part in parts), rewards)
+        return agent.PublishedAgent(tuple(_network(part) for part in parts), ())
 
 
 def _network(part: dict[str, np.ndarray]) -> QNetwork:

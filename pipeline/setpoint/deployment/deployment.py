@@ -17,7 +17,6 @@ from pipeline.setpoint.simulation.actuation import (
     TIP,
     UNPROVEN,
     SetpointLimits,
-    is_evidence,
     still,
 )
 from pipeline.setpoint.simulation.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS
@@ -135,7 +134,7 @@ def camera_seen(
     if foreign is None:
         reason = np.full_like(reason, UNPROVEN)
     else:
-        reason = np.where(is_evidence(reason) & foreign(looks), FOREIGN, reason)
+        reason = np.where((reason == ACTS) & foreign(looks), FOREIGN, reason)
     return window._replace(reason=reason)
 
 

@@ -177,13 +177,11 @@ def _answer(
     shown: Observation,
     keys: jax.Array,
     reason: np.ndarray,
-) -> tuple[Any, np.ndarray, np.ndarray]:
-    """Memory, the change (E, 2) wanted of flow and target, and the reason (E,); the target's only where
-    lambda's clock allows it, none where the window is held."""
+) -> tuple[Any, np.ndarray]:
+    """Memory, and the change (E, 2) wanted of flow and target; the target's only where lambda's clock allows
+    it, none where the window is held."""
     shown = Observation(*(jnp.asarray(a, jnp.int32 if a.dtype.kind == "i" else jnp.float32) for a in shown))
-    memory, (q, u), reason_now = _decided(
-        controller, parameters, memory, shown, jnp.asarray(reason, jnp.int32), keys
-    )
+    memory, (q, u) = _decided(controller, parameters, memory, shown, jnp.asarray(reason, jnp.int32), keys)
     wanted = np.stack(
         [
             np.asarray(FLOW_MOVES)[q],
@@ -191,8 +189,7 @@ def _answer(
         ],
         axis=1,
     )
-    reason = np.asarray(reason_now)
-    return memory, np.where((reason == ACTS)[:, None], wanted, 0.0), reason
+    return memory, np.where((reason == ACTS)[:, None], wanted, 0.0)
 
 
 _decided = eqx.filter_jit(jax.vmap(actuation.decide, (None, None, 0, 0, 0, 0)))
@@ -262,14 +259,14 @@ def run(
             setpoints.value[:, 1],
             acted,
         )
-        memory, wanted, reason = _answer(controller, parameters, memory, shown, step_keys, window.reason)
-        window = window._replace(reason=reason)
+        memory, wanted = _answer(controller, parameters, memory, shown, step_keys, window.reason)
+        acts = window.reason == ACTS
         before, setpoints = setpoints, actuation.moved(setpoints, wanted, time_s, loop.limits)
         change = setpoints.value - before.value
         means = flow.mean(axis=1), temperature.mean(axis=1)
         steps.append((*means, time_s, before.value, change, window, cameras.numbers.copy()))
-        since = np.where(actuation.is_evidence(reason), 0.0, since) + change[:, 0]
-        acted = acted + (reason == ACTS)
+        since = np.where(acts, 0.0, since) + change[:, 0]
+        acted = acted + acts
     flows, temperatures, times, values, changes, windows, segments = zip(*steps, strict=True)
     return Episodes(
         flow=np.stack([*flows, flow.mean(axis=1)], axis=1),

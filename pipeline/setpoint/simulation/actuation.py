@@ -1,7 +1,8 @@
 """What is sent to the machine: when to hold and why, how far setpoints may move, and how long to wait.
 
 The loop through pixels (`pixels`) and the simulators (`simulator`) call the same functions: what is judged is
-what would run. Limits and holds take numpy arrays or jax's, with any leading axes.
+what would run. In the simulators no window is held. Limits and holds take numpy arrays or jax's, with any
+leading axes.
 """
 
 from typing import Any, NamedTuple
@@ -16,21 +17,13 @@ REASONS = (
     "out of distribution",
     "tip moved",
     "cannot judge this camera",
-    "the action is not a number",
-    "the camera is not the one of the table: record levels",
     "the picture stands still",
 )
-ACTS, FEW, FOREIGN, TIP, UNPROVEN, NO_NUMBER, TABLE, STILL = range(8)
+ACTS, FEW, FOREIGN, TIP, UNPROVEN, STILL = range(6)
 REMEMBERED = 64  # actions that the travel of 60 s is summed over: a window takes about a second
 
 
 # ---- when to hold
-
-
-def is_evidence(reason):
-    """Whether the controller is shown a window: those acted on, and those of a camera that is not the
-    table's, so that it may be found to be after all."""
-    return (reason == ACTS) | (reason == TABLE)
 
 
 def still(flow_seen, last_seen):
@@ -41,16 +34,12 @@ def still(flow_seen, last_seen):
 
 def decide(
     controller: Any, parameters: Any, memory: Any, observation: Any, reason: jax.Array, key: jax.Array
-) -> tuple[Any, Any, jax.Array]:
-    """Memory, action and reason of one episode, of a `simulator.SetpointController` that sees an
-    `simulator.Observation`. Memory stays as it was where the window is no evidence, and
-    where the controller takes the camera for another than its table's the reason is TABLE. The action counts
-    where the reason is ACTS; whoever sends it looks."""
+) -> tuple[Any, Any]:
+    """Memory and action of one episode, of a `simulator.SetpointController` that sees a
+    `simulator.Observation`. Memory stays as it was if the window is held. The action counts if the reason is
+    ACTS; whoever sends it looks."""
     after, action = controller.act(parameters, memory, observation, key)
-    seen = is_evidence(reason)
-    memory = jax.tree.map(lambda new, old: jnp.where(seen, new, old), after, memory)
-    strange = controller.strange(parameters, memory) & (reason == ACTS)
-    return memory, action, jnp.where(strange, TABLE, reason)
+    return jax.tree.map(lambda new, old: jnp.where(reason == ACTS, new, old), after, memory), action
 
 
 # ---- what may be sent

@@ -1,17 +1,17 @@
 """The printer as a controller of setpoints meets it: the paper's simulator (Li and Pattinson 2025, eqs. 5-9),
-disturbances in mid-episode, and rollouts.
+a clog in mid-episode, and rollouts.
 
 One decision is one window of frames. At step t the controller sees an
 `Observation` and answers with an `Action`; then
 
-    q_bar <- clip(q_bar + gain a_q, 20, 310)    q = blockage q_bar
-    u_bar <- clip(u_bar + a_u, 180, 240)        if t mod lambda = 0
+    q_bar <- clip(q_bar + a_q, 20, 310)     q = q_bar, clog q_bar from clog_step on
+    u_bar <- clip(u_bar + a_u, 180, 240)    if t mod lambda = 0
     u_hat <- u_hat + (u_bar - u_hat) / delta
 
-What may be sent, how long to wait and when to hold is `actuation`'s, as in the loop through pixels. The
-commanded flow acts at once, and the class depends alone on the true flow q of what the picture shows.
-What a window shows for a flow comes from a `Windows`: `paper_windows()` here, or windows recorded from a
-trained classifier (`recorded.recorded_windows`). Flow is in percent of nominal, temperature in °C.
+What may be sent and how long to wait is `actuation`'s, as in the loop through pixels. The commanded flow
+acts at once, and the class depends alone on the true flow q of what the picture shows. What a window shows
+for a flow comes from a `WindowSource`: `paper_windows()` here, or windows recorded from a trained classifier
+(`recorded.recorded_windows`). Flow is in percent of nominal, temperature in °C.
 """
 
 from collections.abc import Callable
@@ -34,12 +34,10 @@ from pipeline.setpoint.published import (
     TEMPERATURE_MOVES,
 )
 from pipeline.setpoint.simulation import actuation
-from pipeline.setpoint.simulation.actuation import ACTS, FEW, SetpointLimits, Setpoints
+from pipeline.setpoint.simulation.actuation import SetpointLimits, Setpoints
 
 STAND = 2  # the index of no move
 FLOW_LIMITS, TEMPERATURE_LIMITS = (20.0, 310.0), (180.0, 240.0)
-BLOCKAGE_LIMITS = (1 / 3, 3.0)  # beyond, no setpoint within its limits would bring the flow to 100 %
-GAIN_LIMITS = (0.5, 1.2)  # that a drifting gain keeps to
 LIMITS = SetpointLimits(  # of what is sent: the largest change of one action, and of 60 s
     *(np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True)),
     np.array([10.0, 20.0]),
@@ -47,11 +45,10 @@ LIMITS = SetpointLimits(  # of what is sent: the largest change of one action, a
 )
 REMEMBERED = 16  # actions of the last 60 s that limits are of: one takes at least 4 s
 WINDOW_S = 1.0
-CLOG_GOES = 1 / 30  # probability a decision, of clogs that come and go
 HISTORY, CLASSES = 30, 3  # eta and n_c of (8)
 UNDER, GOOD, OVER = 0, 1, 2
 GOOD_BORDERS = (90.0, 110.0)  # percent
-CHANCES = 8  # uniform numbers that a decision takes: three for its window, five for what befalls the machine
+CHANCES = 5  # uniform numbers that a decision takes: three for its window, two for its segment
 
 
 class Observation(NamedTuple):
@@ -81,78 +78,44 @@ class Action(NamedTuple):
     temperature: jax.Array
 
 
-def _never(parameters, memory) -> jax.Array:
-    return jnp.zeros((), bool)
-
-
 class SetpointController(NamedTuple):
-    """start() -> memory; act(parameters, memory, observation, key) -> (memory, action); strange(parameters,
-    memory) -> whether the camera is none that the controller knows, so that it should hold. All pure, for one
+    """start() -> memory; act(parameters, memory, observation, key) -> (memory, action). Both pure, for one
     episode: vmap over episodes, scan over steps."""
 
     start: Callable[[], Any]
     act: Callable[[Any, Any, Observation, jax.Array], tuple[Any, Action]]
-    strange: Callable[[Any, Any], jax.Array] = _never
 
 
 class EpisodeConditions(NamedTuple):
     """One episode's start and machine: scalars, or arrays (n,) with one entry an episode.
 
     flow (percent) and temperature (°C) at the start; accuracy rho of the paper's windows; persistence:
-    decisions that a recorded segment lasts on average, 1 is fresh; gain: true move by commanded move; clog:
-    factor on the flow from clog_step on, 1 is none; drift: relative change of the flow at each step;
-    jump_rate: probability a step that the flow is multiplied by exp(jump_size N(0, 1)).
-
-    As deployed: wait_s after every action; view_s: time after a move until all that a picture shows was laid
-    since, 0 is at once;
-    gain_drift: relative change of the gain at each step, within GAIN_LIMITS; clog_rate: probability a step
-    that a clog comes, and goes again with CLOG_GOES; seen: factor on the flow that the camera reads, against
-    its record; the camera repeats its window for stuck_for decisions from stuck_from on, and shows nothing
-    for blind_for from blind_from on. flow_actions: lambda, of flow to one of temperature.
+    decisions that a recorded segment lasts on average, 1 is fresh; clog: factor on the flow from clog_step
+    on, 1 is none; wait_s after every action; view_s: time after a move until all that a picture shows was
+    laid since, 0 is at once.
     """
 
     flow: jax.Array
     temperature: jax.Array
     accuracy: jax.Array
     persistence: jax.Array
-    gain: jax.Array
     clog: jax.Array
     clog_step: jax.Array
-    drift: jax.Array
-    jump_rate: jax.Array
-    jump_size: jax.Array
     wait_s: jax.Array
     view_s: jax.Array
-    gain_drift: jax.Array
-    clog_rate: jax.Array
-    seen: jax.Array
-    stuck_from: jax.Array
-    stuck_for: jax.Array
-    blind_from: jax.Array
-    blind_for: jax.Array
-    flow_actions: jax.Array
 
 
 class MachineState(NamedTuple):
-    """sent: what the moves reach, (q_bar before blockage, u_bar), and the moves of the last minute; gain and
-    blockage now, clogged by what comes and goes; flow: the true q; flow_move: percent that was sent since the
-    controller last saw a window; segment in [0, 1): the recorded conditions that persist, as a rank among
-    segments; shown: the last window; reason: why it holds, actuation.REASONS; step counts decisions, acted
-    those that were not held."""
+    """sent: what the moves reach, (q_bar before a clog, u_bar), and the moves of the last minute; flow: the
+    true q; segment in [0, 1): the recorded conditions that persist, as a rank among segments; step counts
+    decisions."""
 
     sent: Setpoints
-    gain: jax.Array
-    blockage: jax.Array
-    clogged: jax.Array
     flow: jax.Array
-    flow_move: jax.Array
     temperature: jax.Array
     segment: jax.Array
-    shown: tuple[jax.Array, jax.Array, jax.Array]
-    reason: jax.Array
     time_s: jax.Array
     step: jax.Array
-    acted: jax.Array
 
     @property
     def target(self) -> jax.Array:
@@ -172,8 +135,7 @@ class WindowSource(NamedTuple):
 
 class Trajectory(NamedTuple):
     """n episodes of T decisions: true flow, temperature and target (n, T + 1) with the start first; named (n,
-    T), shares (n, T, 3), action (n, T) as asked where it was sent, and reason (n, T), actuation.REASONS, of
-    each decision."""
+    T), shares (n, T, 3) and action (n, T) as asked, of each decision."""
 
     flow: jax.Array
     temperature: jax.Array
@@ -181,7 +143,6 @@ class Trajectory(NamedTuple):
     named: jax.Array
     shares: jax.Array
     action: Action
-    reason: jax.Array
 
 
 def flow_class(flow: jax.Array) -> jax.Array:
@@ -194,7 +155,7 @@ def nominal(flow, temperature, *, accuracy: float) -> EpisodeConditions:
     temperature (n,); `_replace` what an episode is to meet."""
     flow = jnp.asarray(flow, float)
     one, zero = jnp.ones_like(flow), jnp.zeros_like(flow)
-    ones = dict.fromkeys(("persistence", "gain", "clog", "seen"), one)
+    ones = dict.fromkeys(("persistence", "clog"), one)
     values = dict.fromkeys(EpisodeConditions._fields, zero) | ones
     return EpisodeConditions(
         **values
@@ -203,7 +164,6 @@ def nominal(flow, temperature, *, accuracy: float) -> EpisodeConditions:
             "temperature": jnp.asarray(temperature, float) * one,
             "accuracy": accuracy * one,
             "wait_s": 6.0 * one,
-            "flow_actions": LAMBDA * one,
         }
     )
 
@@ -248,123 +208,57 @@ def _begun(
         jnp.clip(conditions.flow, *FLOW_LIMITS),
         jnp.clip(conditions.temperature, *TEMPERATURE_LIMITS),
     )
-    zero, none = jnp.zeros_like(flow), jnp.zeros_like(flow, jnp.int32)
     state = MachineState(
         sent=actuation.at_rest(jnp.stack([flow, temperature]), remembered=REMEMBERED),
-        gain=conditions.gain,
-        blockage=zero + 1.0,
-        clogged=zero > 0,
         flow=flow,
-        flow_move=zero,
         temperature=temperature,
-        segment=u[6],
-        shown=(jnp.full(CLASSES, 1.0 / CLASSES), none + GOOD, zero + jnp.nan),
-        reason=none + ACTS,
-        time_s=zero,
-        step=none,
-        acted=none,
+        segment=u[4],
+        time_s=jnp.zeros_like(flow),
+        step=jnp.zeros_like(flow, jnp.int32),
     )
-    state = _watched(windows, conditions, state, flow, u[:3])
-    return state, _observation(state)
+    return state, _observed(windows, conditions, state, flow, jnp.zeros_like(flow), u)
 
 
 def stepped(
     windows: WindowSource, conditions: EpisodeConditions, state: MachineState, action: Action, u: jax.Array
 ) -> tuple[MachineState, Observation]:
-    """One decision of one episode: the action, the limits and lags, whatever befalls the machine, and the
-    next window. The reward is `reward(state.flow, state.temperature, ...)`.
+    """One decision of one episode: the action, the limits and lags, and the next window. The reward is
+    `reward(state.flow, state.temperature, ...)`.
 
-    u (CHANCES,) are the chances, uniform in [0, 1), which the caller draws for many at once. An action that
-    answers a window that holds is not sent.
+    u (CHANCES,) are the chances, uniform in [0, 1), which the caller draws for many at once.
     """
-    sent, wait_s, executed = _sent(conditions, state, action)
-    t = state.step + 1
-    blockage, clogged = _blocked(conditions, state, t, u)
-    reached = blockage * sent.value[0]
+    heeded = state.step % LAMBDA == 0
+    target_move = jnp.where(heeded, jnp.asarray(TEMPERATURE_MOVES)[action.temperature], 0.0)
+    asked = jnp.stack([jnp.asarray(FLOW_MOVES)[action.flow], target_move])
+    sent = actuation.moved(state.sent, asked, state.time_s, LIMITS)
+    change, step = sent.value - state.sent.value, state.step + 1
+    wait_s = actuation.wait_after(change, actuation.Waits(*3 * (conditions.wait_s,)))
+    flow = jnp.where(step >= conditions.clog_step, conditions.clog, 1.0) * sent.value[0]
     # of what the window's middle shows, the share that was laid before the move
     before = jnp.clip(1.0 - (wait_s + WINDOW_S / 2) / jnp.maximum(conditions.view_s, 1e-3), 0.0, 1.0)
-    seen = reached + (state.flow - reached) * before
-    saw = actuation.is_evidence(state.reason)
-    state = state._replace(
+    shown = flow + (state.flow - flow) * before
+    state = MachineState(
         sent=sent,
-        gain=jnp.clip(
-            state.gain * (1.0 + conditions.gain_drift),
-            jnp.minimum(conditions.gain, GAIN_LIMITS[0]),
-            jnp.maximum(conditions.gain, GAIN_LIMITS[1]),
-        ),
-        blockage=blockage,
-        clogged=clogged,
-        flow=reached,
-        flow_move=executed + jnp.where(saw, 0.0, state.flow_move),
+        flow=flow,
         temperature=state.temperature + (sent.value[1] - state.temperature) / DELTA,  # (6)
-        segment=jnp.where(u[5] * conditions.persistence < 1.0, u[6], state.segment),
+        segment=jnp.where(u[3] * conditions.persistence < 1.0, u[4], state.segment),
         time_s=state.time_s + wait_s + WINDOW_S,
-        step=t,
-        acted=state.acted + (state.reason == ACTS),
+        step=step,
     )
-    state = _watched(windows, conditions, state, seen, u[:3])
-    return state, _observation(state)
+    return state, _observed(windows, conditions, state, shown, change[0], u)
 
 
-def _sent(
-    conditions: EpisodeConditions, state: MachineState, action: Action
-) -> tuple[Setpoints, jax.Array, jax.Array]:
-    """What is sent of an action, the wait after it in s, and the flow's executed move in percent as
-    commanded. The flow is limited where it arrives: a move of a reaches gain a."""
-    acts = state.reason == ACTS
-    heeded = acts & (state.acted % conditions.flow_actions == 0)
-    asked = jnp.stack(
-        [
-            jnp.where(acts, jnp.asarray(FLOW_MOVES)[action.flow], 0.0),
-            jnp.where(heeded, jnp.asarray(TEMPERATURE_MOVES)[action.temperature], 0.0),
-        ]
-    )
-    scale = jnp.stack([state.gain, jnp.ones_like(state.gain)])
-    limits = LIMITS._replace(per_action=LIMITS.per_action * scale, per_minute=LIMITS.per_minute * scale)
-    sent = actuation.moved(state.sent, asked * scale, state.time_s, limits)
-    change = sent.value - state.sent.value
-    return (
-        sent,
-        actuation.wait_after(change, actuation.Waits(*3 * (conditions.wait_s,))),
-        change[0] / state.gain,
-    )
-
-
-def _blocked(
-    conditions: EpisodeConditions, state: MachineState, t: jax.Array, u: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Blockage, and whether a clog that comes and goes is there."""
-    jump = jnp.where(u[3] < conditions.jump_rate, conditions.jump_size * _normal(u[4]), 0.0)
-    comes = ~state.clogged & (u[7] < conditions.clog_rate)
-    goes = state.clogged & (u[7] > 1.0 - CLOG_GOES)
-    blockage = (
-        state.blockage
-        * jnp.where((t == conditions.clog_step) | comes, conditions.clog, 1.0)
-        / jnp.where(goes, conditions.clog, 1.0)
-        * (1.0 + conditions.drift)
-        * jnp.exp(jump)
-    )
-    return jnp.clip(blockage, *BLOCKAGE_LIMITS), (state.clogged | comes) & ~goes
-
-
-def _watched(
-    windows: WindowSource, conditions: EpisodeConditions, state: MachineState, flow: jax.Array, u: jax.Array
-) -> MachineState:
-    """The state with the window that the camera shows of this flow, and whether that holds."""
-    fresh = windows.draw(windows.table, conditions, conditions.seen * flow, state.segment, u)
-    stuck = _lasts(state.step, conditions.stuck_from, conditions.stuck_for)
-    shown = jax.tree.map(lambda new, old: jnp.where(stuck, old, new), fresh, state.shown)
-    blind = _lasts(state.step, conditions.blind_from, conditions.blind_for)
-    reason = jnp.where(blind, FEW, actuation.still(shown[2], state.shown[2]))
-    return state._replace(shown=shown, reason=reason.astype(jnp.int32))
-
-
-def _lasts(step: jax.Array, begins: jax.Array, decisions: jax.Array) -> jax.Array:
-    return (step >= begins) & (step < begins + decisions)
-
-
-def _observation(state: MachineState) -> Observation:
-    return Observation(*state.shown, state.flow_move, state.temperature, state.sent.value[1], state.acted)
+def _observed(
+    windows: WindowSource,
+    conditions: EpisodeConditions,
+    state: MachineState,
+    flow: jax.Array,
+    flow_move: jax.Array,
+    u: jax.Array,
+) -> Observation:
+    """What the camera shows of this flow, after this move of its setpoint."""
+    shown = windows.draw(windows.table, conditions, flow, state.segment, u[:3])
+    return Observation(*shown, flow_move, state.temperature, state.target, state.step)
 
 
 def first_history(length: int = HISTORY) -> jax.Array:
@@ -425,9 +319,8 @@ def _rolled(
         state, observation, memory = carry
         u, t = chance
         now = jax.vmap(jax.random.fold_in, (0, None))(keys, t)
-        decide = jax.vmap(actuation.decide, (None, None, 0, 0, 0, 0))
-        memory, action, reason = decide(controller, parameters, memory, observation, state.reason, now)
-        state = state._replace(reason=reason)
+        act = jax.vmap(controller.act, (None, 0, 0, 0))
+        memory, action = act(parameters, memory, observation, now)
         after, next_observation = jax.vmap(stepped, (None, 0, 0, 0, 0))(windows, conditions, state, action, u)
         return (after, next_observation, memory), (
             after.flow,
@@ -436,7 +329,6 @@ def _rolled(
             observation.named,
             observation.shares,
             action,
-            reason,
         )
 
     state, observation = first

@@ -1,0 +1,148 @@
+"""What Li and Pattinson (2025) say of their camera, tried on rendered pictures: the hard mask against the
+whole crop, ADR against none, and windows of several lengths (sections 2.2 and 2.4).
+
+`./run dvc repro datasets/papers/dvc.yaml:camera` writes datasets/papers/camera.json; minutes. One small
+network with the paper's patches learns 4,500 pictures as the paper deals them: 300 of each of three classes
+at five temperatures. Without the mask it sees the whole crop, 350 x 350 px, equalised and resized to its 48 x
+16 px.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pipeline.papers import files
+from pipeline.setpoint.frames import nozzle_scene
+from pipeline.setpoint.frames.key_area import SHAPE
+from pipeline.setpoint.vision import classifier
+from pipeline.setpoint.vision.classifier import Labelled, TrainingSettings
+from pipeline.setpoint.vision.vision_transformer import Classifier, Size, vision_transformer
+
+SEED, EPOCHS = 1, 8
+# segments of each class at each temperature, and pictures of each: 300 to learn from as in the paper
+LEARNED, HELD_OUT, JUDGED = (20, 15), (2, 15), (6, 40)
+WINDOWS = (5, 10, 20, 40)  # pictures
+SHAKEN_PX = 5.0  # by which the tip is elsewhere than calibrated, at most, in either direction
+NETWORK = Size((4, 4), 64, 2, 4, 128, 64, 16)
+TRAINING = TrainingSettings(EPOCHS, 1.0, 64, 0.002, 0.01, 0.0, 0.99, EPOCHS)
+
+
+class Filmed(NamedTuple):
+    """n pictures in which a line is found: its key areas, those of a tip that is shaken, and the whole crops
+    (n, 16, 48) uint8; then temperature, class, flow and segment as Labelled has them."""
+
+    key_area: np.ndarray
+    shaken: np.ndarray
+    whole: np.ndarray
+    truth: tuple[np.ndarray, ...]
+
+    def seen(self, name: str) -> Labelled:
+        return Labelled(getattr(self, name), *self.truth)
+
+
+def film(rng: np.random.Generator, segments: int, frames: int, first: int) -> Filmed:
+    """`frames` pictures of so many segments of each class at each temperature, segments numbered from
+    first."""
+    pieces: list[tuple[np.ndarray, ...]] = []
+    for kind in range(len(classifier.CLASS_NAMES)):
+        for degrees in nozzle_scene.TEMPERATURES:
+            for percent in nozzle_scene.draw_class_flow(rng, kind, segments):
+                segment, flow = nozzle_scene.draw_segment(rng), np.full(frames, percent)
+                scene = nozzle_scene.render(segment, flow, degrees, rng)
+                x, y = np.add(scene.tip, rng.uniform(-SHAKEN_PX, SHAKEN_PX, 2))
+                clear, shaken = (
+                    nozzle_scene.key_areas(one, least_score=0.0)
+                    for one in (scene, scene._replace(tip=(x, y)))
+                )
+                truth = (
+                    scene.temperature,
+                    nozzle_scene.label(flow),
+                    flow,
+                    np.full(frames, first + len(pieces)),
+                )
+                usable = clear.valid & shaken.valid
+                columns = clear.images, shaken.images, whole_crops(scene.frames), *truth
+                pieces.append(tuple(column[usable] for column in columns))
+    columns = [np.concatenate(column) for column in zip(*pieces, strict=True)]
+    return Filmed(*columns[:3], tuple(columns[3:]))
+
+
+def whole_crops(frames: np.ndarray) -> np.ndarray:
+    """Frames (n, 350, 350), equalised, in as many pixels as a key area has (n, 16, 48)."""
+    size = SHAPE[::-1]
+    return np.array([cv2.resize(cv2.equalizeHist(a), size, interpolation=cv2.INTER_AREA) for a in frames])
+
+
+def learned(parts: Sequence[Filmed], name: str, augment: Callable) -> Classifier:
+    """The network that learns what `name` of the first of these parts shows, with this augmentation; its
+    epoch is chosen by the second."""
+    network = vision_transformer(NETWORK, np.random.default_rng(SEED))
+    state = classifier.untrained(network, epochs=EPOCHS)
+    seen = [part.seen(name) for part in parts[:2]]
+    return classifier.train(state, *seen, TRAINING, key=jax.random.key(SEED), augment=augment).best
+
+
+def named(network: Classifier, seen: Labelled) -> np.ndarray:
+    """The class (n,) of each picture."""
+    ask = jax.jit(lambda images, degrees: jnp.argmax(network(images, degrees), axis=1))
+    parts = np.array_split(np.arange(len(seen.label)), max(len(seen.label) // 500, 1))
+    return np.concatenate([np.asarray(ask(*(a[rows] for a in seen[:2]))) for rows in parts])
+
+
+def right(network: Classifier, seen: Labelled) -> float:
+    """Percent of the pictures whose class is named rightly."""
+    return 100.0 * float(np.mean(named(network, seen) == seen.label))
+
+
+def right_windows(names: np.ndarray, seen: Labelled, length: int) -> float:
+    """Percent of the windows of so many pictures in a row of one segment in which the most frequent class,
+    the largest of (4), is the true one."""
+    hits = []
+    for segment in np.unique(seen.segment):
+        rows = np.flatnonzero(seen.segment == segment)
+        for some in rows[: len(rows) // length * length].reshape(-1, length):
+            hits.append(np.bincount(names[some], minlength=3).argmax() == seen.label[some[0]])
+    return 100.0 * float(np.mean(hits))
+
+
+def main() -> None:
+    rng, first = np.random.default_rng(SEED), 0
+    parts = []
+    for segments, frames in (LEARNED, HELD_OUT, JUDGED):
+        parts.append(film(rng, segments, frames, first))
+        first += len(classifier.CLASS_NAMES) * len(nozzle_scene.TEMPERATURES) * segments
+    judged = parts[2]
+    networks = {
+        "mask_adr": learned(parts, "key_area", classifier.adr),
+        "mask": learned(parts, "key_area", lambda key, x: x),
+        "whole_adr": learned(parts, "whole", classifier.adr),
+    }
+    percent: dict[str, Any] = {
+        name: right(network, judged.seen("whole" if name.startswith("whole") else "key_area"))
+        for name, network in networks.items()
+    }
+    percent |= {
+        f"{name}_shaken": right(networks[name], judged.seen("shaken")) for name in ("mask_adr", "mask")
+    }
+    seen = judged.seen("key_area")
+    names = named(networks["mask_adr"], seen)
+    files.write(
+        "camera",
+        percent
+        | {
+            "pictures": [len(part.whole) for part in parts],
+            "mask_helps": percent["mask_adr"] > percent["whole_adr"],
+            "adr_helps": percent["mask_adr_shaken"] > percent["mask_shaken"],
+            "shaken_px": SHAKEN_PX,
+            "lengths": list(WINDOWS),
+            "windows": [right_windows(names, seen, length) for length in WINDOWS],
+        },
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""What Li and Pattinson (2025) do not print of their fourth phase, searched: every setting of SEARCH from
+every seed of SEEDS, all four phases, of the fourth the best checkpoint.
+
+`./run dvc repro datasets/papers/dvc.yaml:search_agent` writes datasets/papers/search_agent.json, from which
+train_agent takes setting and seed; an hour. What the same code trained is in datasets/memo/search_agent.
+Validation runs alone choose checkpoint, setting and seed: the runs that an agent is judged by choose nothing.
+"""
+
+import itertools
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import joblib
+import numpy as np
+from pydantic import Field
+
+from pipeline.papers import files, made
+from pipeline.setpoint.agents import agent, score
+from pipeline.setpoint.published import PHASES
+from pipeline.store import artifacts, params
+from pipeline.store.params import Section
+
+MEMO = Path("datasets/memo/search_agent")
+SEEDS = (1, 2, 3)
+# exploration as each phase begins, episodes at once, and the share of the learning rate left at the end
+SEARCH: dict[str, tuple[Any, ...]] = {
+    "explore": ([1.0, 0.3, 0.3, 0.3], [1.0, 0.3, 0.3, 1.0]),
+    "environments": (8, 32),
+    "rate_at_end": (1.0, 0.05),
+}
+LOOP = Path("pipeline/setpoint")
+# the code that decides what an agent comes to, which sees no recorded window
+CODE = (
+    "agents/agent.py", "agents/criteria.py", "agents/score.py", "agents/trials.py", "simulation/simulator.py",
+    "simulation/actuation.py", "published.py",
+)  # fmt: skip
+
+
+class TrainAgent(Section):
+    """Section `train_agent`, the agent of Li and Pattinson (2025) without what is searched: batch,
+    transitions remembered, steps of an episode, Adam's rate, discount, the target network's step, updates of
+    each phase, exploration in the end, accuracy of the last phase, classes of its history, eta."""
+
+    batch: int = Field(ge=1, le=100_000)
+    capacity: int = Field(ge=1000, le=10_000_000)
+    episode: int = Field(ge=10, le=10_000)
+    learning_rate: float = Field(gt=0, le=1)
+    gamma: float = Field(ge=0, lt=1)
+    tau: float = Field(gt=0, le=1)
+    updates: list[Annotated[int, Field(ge=1, le=10_000_000)]] = Field(min_length=4, max_length=4)
+    least: float = Field(ge=0, le=1)
+    accuracy: float = Field(gt=0.34, le=1)
+    history: int = Field(ge=1, le=1000)
+
+
+def training(settings: TrainAgent, chosen: Mapping[str, Any]) -> agent.PublishedTraining:
+    """These settings with a choice of SEARCH, as the method takes them."""
+    numbers = settings.model_dump() | chosen
+    numbers |= {name: tuple(numbers[name]) for name in ("updates", "explore")}
+    dqn = agent.DqnSettings(**{name: numbers[name] for name in agent.DqnSettings._fields})
+    own = {name: numbers[name] for name in agent.PublishedTraining._fields if name in numbers}
+    return agent.PublishedTraining(dqn=dqn, **own)
+
+
+def first_key(seed: int) -> jax.Array:
+    """The key that training from this seed begins with."""
+    return jax.random.fold_in(jax.random.key(seed), 0)
+
+
+class SearchedRun(NamedTuple):
+    """One setting from one seed: updates of phase 4 before its best checkpoint, as validation chose it, and
+    the percent of validation runs that settle, and that settle and stay; the same of fresh runs, of the best
+    checkpoint and of the phase's end."""
+
+    updates: int
+    validated_settled: float
+    validated_stay: float
+    settled: float
+    stay: float
+    settled_at_end: float
+    stay_at_end: float
+
+
+@cache
+def third_phase(seed: int, how: agent.PublishedTraining) -> tuple[agent.DqnState, jax.Array]:
+    """The train state after phase 3, and the key of all phases."""
+    train_state, key = agent.begin_published(first_key(seed), how)
+    for i in range(len(PHASES)):
+        train_state = agent.published_phase(train_state, key, how, i).train_state
+    return train_state, key
+
+
+def searched_run(settings: TrainAgent, chosen: Mapping[str, Any], seed: int) -> SearchedRun:
+    """All phases by these settings from this seed."""
+    code = [made.code_digest((LOOP / name).read_text(encoding="utf-8")) for name in CODE]
+    digest = joblib.hash((settings.model_dump() | chosen, seed, code, jax.__version__))
+    entry = MEMO / f"{digest}.json"
+    if entry.is_file():
+        return SearchedRun(**artifacts.read_json(entry))
+    how = training(settings, chosen)
+    # what phase 4 alone sees is the same for all, so that phases 1 to 3 are trained once
+    shared = how._replace(rate_at_end=1.0, explore=(*how.explore[:3], 1.0))
+    train_state, key = third_phase(seed, shared)
+    result = agent.published_phase(train_state, key, how, len(PHASES))
+    best = agent.best_checkpoint(result, key, how)
+    shares = []
+    for network in (best.network, result.train_state.network):
+        path = agent.run_starts(network, accuracy=how.accuracy)
+        told = score.judge(np.asarray(path.flow), np.asarray(path.temperature))
+        shares += [told.settled.percent, told.stay.percent]
+    updates = best.after * how.updates[-1] // agent.CHECKPOINTS
+    run = SearchedRun(updates, best.settled, best.stay, *shares)
+    MEMO.mkdir(parents=True, exist_ok=True)
+    artifacts.write_json(entry, run._asdict())
+    print(seed, chosen, run, flush=True)
+    return run
+
+
+def search(settings: TrainAgent) -> dict[str, Any]:
+    """Every setting from every seed; the setting whose seeds stay most on average in validation, and of it
+    the seed that stays most there."""
+    grid = [dict(zip(SEARCH, values, strict=True)) for values in itertools.product(*SEARCH.values())]
+    runs: list[list[SearchedRun]] = [[] for _ in grid]
+    for seed in SEEDS:
+        for chosen, found in zip(grid, runs, strict=True):
+            found.append(searched_run(settings, chosen, seed))
+    rows: list[dict[str, Any]] = [
+        chosen | {name: [getattr(run, name) for run in found] for name in SearchedRun._fields}
+        for chosen, found in zip(grid, runs, strict=True)
+    ]
+    best = max(rows, key=lambda row: np.mean(row["validated_stay"]))
+    k = int(np.argmax(best["validated_stay"]))
+    ends = {
+        f"{name}_{end.__name__}": end(value for row in rows for value in row[name])
+        for name in ("settled", "stay", "stay_at_end")
+        for end in (min, max)
+    }
+    return {
+        "settings": len(grid), "seeds": len(SEEDS), "updates": settings.updates[-1], "rows": rows,
+        "best": {name: best[name] for name in SEARCH}, "seed": SEEDS[k],
+        "kept": {name: best[name][k] for name in SearchedRun._fields},
+        "best_stay_min": min(best["stay"]), "best_stay_max": max(best["stay"]), **ends,
+    }  # fmt: skip
+
+
+def main() -> None:
+    files.write("search_agent", search(params.load(TrainAgent, "train_agent", params.PAPERS)))
+
+
+if __name__ == "__main__":
+    main()
