@@ -22,6 +22,7 @@ from pipeline.setpoint.agents import agent, score
 from pipeline.setpoint.published import PHASES
 from pipeline.store import artifacts, params
 from pipeline.store.params import Section
+from pipeline.store.pins import check_pins
 
 MEMO = Path("datasets/memo/search_agent")
 SEEDS = (1, 2, 3)
@@ -147,6 +148,8 @@ def search(settings: TrainAgent) -> dict[str, Any]:
 
 
 def main() -> None:
+    # another order of sums, another agent: the last digits of a step decide what a phase ends at
+    check_pins("search_agent")
     files.write("search_agent", search(params.load(TrainAgent, "train_agent", params.PAPERS)))
 
 

@@ -20,6 +20,7 @@ from pipeline.setpoint.published import ALPHA, DELTA, SIGMA
 from pipeline.setpoint.simulation.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS
 from pipeline.setpoint.tables import AGENT_CURVE
 from pipeline.store import artifacts, params
+from pipeline.store.pins import check_pins
 
 FOLDER = Path("datasets/papers/train_agent")
 # points of a learning curve that a page has room for, of each phase
@@ -70,6 +71,7 @@ def guesses(how: agent.PublishedTraining) -> dict[str, Any]:
 
 
 def main() -> None:
+    check_pins("train_agent")
     searched = artifacts.read_json("datasets/papers/search_agent.json")
     how = training(params.load(TrainAgent, "train_agent", params.PAPERS), searched["best"])
     published = agent.train_published(first_key(searched["seed"]), how)
