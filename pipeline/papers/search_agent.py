@@ -29,7 +29,7 @@ SEEDS = (1, 2, 3)
 # exploration as each phase begins, episodes at once, and the share of the learning rate left at the end
 SEARCH: dict[str, tuple[Any, ...]] = {
     "explore": ([1.0, 0.3, 0.3, 0.3], [1.0, 0.3, 0.3, 1.0]),
-    "environments": (8, 32),
+    "environments": (32,),
     "rate_at_end": (1.0, 0.05),
 }
 LOOP = Path("pipeline/setpoint")
