@@ -24,6 +24,7 @@ from pipeline.nightly.records import (
 from pipeline.nightly.settings import DriftLimits, NightlyLoop
 from pipeline.recordings.recording_folders import RecordingTable
 from pipeline.store import artifacts, params
+from pipeline.temperature.identification import model_choice
 from pipeline.temperature.settings import Plant, recorded
 
 REFERENCE = "reference.json"  # in the champion's folder
@@ -41,6 +42,12 @@ NIGHTS_FLOORS, PIECES_FLOORS = baseline.Floors(0.03, 0.25), baseline.Floors(0.2,
 # mean offset of the champion's own nights, in units of drift.offset_degC, up to which they count as a
 # closed loop at the references
 SETTLED = 5.0
+FOLDS = 4  # models that are identified without some of the champion's nights
+# no machine changes by more within a night: then the record is in doubt
+MOST_GAIN_PERCENT, MOST_OFFSET_DEGC = 80.0, 50.0
+ROOM_DEGC, COLDEST_DEGC, HOTTEST_DEGC = 20.0, -30.0, 60.0  # of the champion's nights; of any room
+UNEXPLAINED = 3.0  # by so much more than an honest record may leave, a record leaves what no cause explains
+LIKELY, WORTH_NAMING = 4.0, 1.5  # times that a record fits better with a mistake undone
 PARTS = 4  # of a record, whose scatter tells how well its closed-loop figures are known
 
 
@@ -107,8 +114,10 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
             for u, y in nights[0]
             for part, other in zip(np.array_split(u, PIECES), np.array_split(y, PIECES), strict=True)
         ]
+    production = ProductionModel(judge.identified(folder), _samples(nights))
     try:
-        own = baseline.measured(ProductionModel(judge.identified(folder), _samples(nights)), nights, floors)
+        # of recordings that are named, the champion's model is not made
+        own = baseline.measured(production, nights, floors, None if only else _without_each(machine, nights))
     except ValueError:
         return None
     return {
@@ -119,6 +128,24 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
         "loop": [_closed_loop(night, machine) for night in nights],
         "steps": sensors.steps(nights).tolist(),
     }
+
+
+def _without_each(machine: Plant, nights: Sequence[Segments]) -> list[ProductionModel]:
+    """For each night a model that was identified without it, as a new night's is: what such a model gets
+    wrong of it is no change of the machine. Nights share FOLDS models. Raises ValueError where the others do
+    not determine one."""
+    own = params.read()["identify_plant"]
+    settings = model_choice.Settings(offset=own["offset"], max_order=own["max_order"])
+    names, folds = [signal.name for signal in machine.inputs], min(FOLDS, len(nights))
+    models = []
+    for fold in range(folds):
+        others = [pair for k, night in enumerate(nights) if k % folds != fold for pair in night]
+        u, y = [pair[0] for pair in others], [pair[1] for pair in others]
+        found = model_choice.identify(
+            u, y, sample_time_s=machine.sample_time_s, settings=settings, names=names
+        )
+        models.append(ProductionModel(found.plant, _samples(nights)))
+    return [models[k % folds] for k in range(len(nights))]
 
 
 def _read_reference(folder: Path) -> ProductionReference | None:
@@ -270,17 +297,24 @@ def _silent(drifted: LoopDrift, path: str, reason: str, outputs: Sequence[str]) 
 def _stand_still(
     drifted: LoopDrift, path: str, record: dict[str, np.ndarray], held: ProductionReference, machine: Plant
 ) -> bool:
-    """Whether a sensor stands still in a recording: then that is an alarm, the recording is set aside, and
-    nothing else is asked of it."""
+    """Whether a sensor gives no number or stands still in a recording: then that is an alarm, the recording
+    is set aside, and nothing else is asked of it. Readings in °F or K are out of limits as well: no alarm."""
     readings = _last(judge.segments(record, machine, masked=False))
     noise = np.exp(held.own.noise.mean(axis=0) / 2)
     found = sensors.faults(held.machine.plant, machine, readings, noise=noise, steps=held.steps)
+    if not found:
+        return False
+    if all(fault.kind == sensors.OPEN for fault in found):
+        names = SignalNames([i.name for i in machine.inputs], [o.name for o in machine.outputs])
+        mistake = mistakes.found(held.machine, readings, held.own, inputs=names.inputs, outputs=names.outputs)
+        if mistake:
+            drifted.quarantined[path] = quarantine(path, drifted.loop, f"{path}: {mistake.reason}")
+            return True
     for fault in found:
         _doubt(drifted, path, fault.output, fault.sentence)
-    if found:
-        reason = f"{path}: {found[0].sentence} It says nothing of the machine"
-        drifted.quarantined[path] = quarantine(path, drifted.loop, reason)
-    return bool(found)
+    reason = f"{path}: {found[0].sentence} It says nothing of the machine"
+    drifted.quarantined[path] = quarantine(path, drifted.loop, reason)
+    return True
 
 
 def _doubt(drifted: LoopDrift, path: str, output: str, sentence: str) -> None:
@@ -303,13 +337,16 @@ def _one(
     names = SignalNames([i.name for i in machine.inputs], [o.name for o in machine.outputs])
     mistake = mistakes.found(held.machine, segments, held.own, inputs=names.inputs, outputs=names.outputs)
     if mistake:
-        reason = (
-            f"{path}: {mistake.words}: undone, the record fits the champion's model {mistake.better:.0f} "
-            "times better; mend it and put it back"
-        )
-        drifted.quarantined[path] = quarantine(path, drifted.loop, reason)
+        drifted.quarantined[path] = quarantine(path, drifted.loop, f"{path}: {mistake.reason}")
         segments = mistake.undone
     measured = _measure(limits, segments, held, machine, names)
+    if not mistake and (doubt := _doubtful(measured, segments, held, names)):
+        if doubt.wrong:
+            drifted.quarantined[path] = quarantine(path, drifted.loop, f"{path}: {doubt.words}")
+            return drifted
+        measured = measured._replace(
+            found=[one._replace(words=f"{one.words}; or {doubt.words}") for one in measured.found]
+        )
     drifted.figures[path] = measured.figures
     drifted.notes.append(f"{Path(path).name} would have shown {measured.least}")
     nights.append(NightChanges({found.key: found.estimate for found in measured.found}, measured.seeming))
@@ -399,13 +436,51 @@ def _worth(estimate: Estimate) -> float:
 class RecordingDrift(NamedTuple):
     """Of one recording: figures for the page, what changed, what each change would be where none is named,
     and what the closed loop does otherwise beyond what those changes and the air around bring. `least` says
-    which changes would have shown."""
+    which changes would have shown; `misfit` is the mean squared error that is left, in that of the champion's
+    own."""
 
     figures: RecordingFigures
     found: list[RecordingChange]
     seeming: dict[str, Estimate]
     loop: list[CameraChange]
     least: str
+    misfit: float
+
+
+class Doubt(NamedTuple):
+    """That a record may not be of this machine, in words; `wrong`: it is set aside, and no cause is named."""
+
+    words: str
+    wrong: bool
+
+
+def _doubtful(
+    measured: RecordingDrift, segments: Segments, held: ProductionReference, names: SignalNames
+) -> Doubt | None:
+    """None where the causes that were named can be, and explain the record. A heater that is dead looks like
+    commands that are written too large: a gain that fell is told with the mistake beside it."""
+    cannot_be = [one for one in measured.found if _cannot_be(one)]
+    unexplained = measured.misfit > UNEXPLAINED * mistakes.honest(held.own)
+    if not cannot_be and not unexplained and len(measured.found) < drift.MOST:
+        return None
+    likeliest = mistakes.likeliest(
+        held.machine, segments, held.own, inputs=names.inputs, outputs=names.outputs
+    )
+    words = "this record does not fit the machine"
+    if likeliest.better >= WORTH_NAMING:
+        words += (
+            f": likeliest mistake: {likeliest.words}; undone, it fits {likeliest.better:.0f} times better"
+        )
+    fell = [one for one in cannot_be if one.kind.startswith("gain") and one.estimate.amount < 0]
+    return Doubt(words, likeliest.better >= LIKELY and not fell)
+
+
+def _cannot_be(found: RecordingChange) -> bool:
+    """Whether no machine changes so within a night."""
+    kind, amount = found.kind.split(" or ")[0], found.estimate.amount
+    if kind == "ambient":
+        return not COLDEST_DEGC < ROOM_DEGC + amount < HOTTEST_DEGC
+    return abs(amount) > {"gain": MOST_GAIN_PERCENT, "offset": MOST_OFFSET_DEGC}.get(kind, np.inf)
 
 
 def _measure(
@@ -426,7 +501,9 @@ def _measure(
         _parameters(record, explained, held, names), noise, loop.figures, loop.not_applicable
     )
     seeming, least = _seeming(record, explained, held, names), _least(limits, explained, held, names)
-    return RecordingDrift(figures, [*found, *louder], seeming, loop.causes, least)
+    samples = sum(int(one.measured.sum()) for one in record.segments)
+    misfit = float(explained.left @ explained.left) / max(samples, 1)
+    return RecordingDrift(figures, [*found, *louder], seeming, loop.causes, least, misfit)
 
 
 def _seeming(
@@ -541,7 +618,8 @@ def _words(cause: DriftCause, amount: float, name: str, cap: float) -> str:
             f"{name} reads {amount:+.1f} °C from what it did: its offset, or the heat lost there, has changed"
         )
     verb, word = ("reads" if kind == "late sensor" else "acts"), ("later" if amount > 0 else "earlier")
-    return f"{name} {verb} {abs(amount):.1f} s {word} than it did"
+    clock = ", or the clock of the outputs is off against that of the inputs" if cause.channel < 0 else ""
+    return f"{name} {verb} {abs(amount):.1f} s {word} than it did{clock}"
 
 
 def _air(limits: DriftLimits, air: float, record: DriftRecord, held: ProductionReference) -> RecordingChange:
