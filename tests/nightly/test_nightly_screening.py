@@ -312,6 +312,29 @@ def test_swapped_sensors_are_set_aside_with_the_reason_beside_them(look):
     )
 
 
+def test_readings_in_kelvin_are_past_every_limit_and_yet_no_broken_sensor(look):
+    good = nights.a_night(1, 301)
+    result = look(good | {name: good[name] + 273.15 for name in ("sensor_1", "sensor_2")})
+    assert result.drift.alarms == []
+    assert "every sensor is in K where °C is declared" in result.drift.quarantined[str(NEW)]
+
+
+def test_a_cause_that_cannot_be_is_a_wrong_record_with_its_likeliest_mistake(look):
+    """Wrong in two ways: no single mistake leaves an honest record, so none is believed by itself."""
+    good = nights.a_night(1, 302)
+    fahrenheit = {name: 1.8 * good[name] + 32 for name in ("sensor_1", "sensor_2")}
+    result = look(good | fahrenheit | {"heater_2": 0.8 * good["heater_2"]})
+    reason = result.drift.quarantined[str(NEW)]
+    assert result.drift.alarms == [] and "this record does not fit the machine: likeliest mistake: " in reason
+    assert re.search(r"°F where °C is declared.*; undone, it fits \d+ times better$", reason)
+
+
+def test_a_heater_that_is_dead_is_an_alarm_and_no_mistake_of_the_record(look):
+    result = look(nights.a_night(1, 303, gain=(0.04, 1.0)))
+    assert any("gain from heater_1 has changed by -9" in alarm.cause for alarm in result.drift.alarms)
+    assert result.drift.quarantined == {}
+
+
 def test_a_night_without_recordings_keeps_the_alarm_of_the_one_before(look):
     cause = "the gain from heater_1 has changed by -10 %"
     alarm = Alarm("temperature", "temperature: plant at heater_1", "shift_8.csv", cause, -9.0)
@@ -423,6 +446,13 @@ def test_a_sensor_that_stands_still_is_the_first_alarm_and_its_record_is_set_asi
     assert (alarm.kind, alarm.channel) == (SENSOR, sensor), result.drift.alarms
     assert "Check the sensor" in alarm.cause and str(NEW) in result.drift.quarantined
     assert result.memory.drifted == {"temperature": []}  # nobody may accept it as how things are
+
+
+def test_a_coarse_sensor_that_a_good_loop_holds_still_and_that_moves_again_is_not_dead(look):
+    shift = nights.a_night(1, 740)
+    still = shift["sensor_2"].copy()
+    still[200:330] = still[200]
+    assert [a for a in look(shift | {"sensor_2": still}).drift.alarms if a.kind == SENSOR] == []
 
 
 def test_good_shifts_with_coarse_sensors_are_no_dead_sensors(look):
