@@ -1,6 +1,7 @@
 """The temperature loop's part of a night: new recordings held against those of the champion. A record that is
 not what it says is set aside, and what it says of the machine, put right, counts all the same."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +26,8 @@ from pipeline.nightly.settings import DriftLimits, NightlyLoop
 from pipeline.recordings.recording_folders import RecordingTable
 from pipeline.store import artifacts, params
 from pipeline.temperature.identification import model_choice
-from pipeline.temperature.settings import Plant, recorded
+from pipeline.temperature.settings import Plant, PlantSignal, recorded
+from pipeline.temperature.tables import set_point_of
 
 REFERENCE = "reference.json"  # in the champion's folder
 PIECES = 4  # into which a single record of the champion is cut, to stand for nights
@@ -48,6 +50,7 @@ MOST_GAIN_PERCENT, MOST_OFFSET_DEGC = 80.0, 50.0
 ROOM_DEGC, COLDEST_DEGC, HOTTEST_DEGC = 20.0, -30.0, 60.0  # of the champion's nights; of any room
 UNEXPLAINED = 3.0  # by so much more than an honest record may leave, a record leaves what no cause explains
 LIKELY, WORTH_NAMING = 4.0, 1.5  # times that a record fits better with a mistake undone
+SHORTEST = 60  # samples of a stretch at one set-point that can settle
 PARTS = 4  # of a record, whose scatter tells how well its closed-loop figures are known
 
 
@@ -104,9 +107,11 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
     """champion/<loop>/reference.json of the model below `folder`, from the loop's recordings, or `only` those
     named; None where they are none, or too short."""
     machine = recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet")
-    records = judge.record_segments(Path(loop.recordings), machine, broken={})
+    records = judge.read_records(Path(loop.recordings), machine, {})
     named = [path.removeprefix(f"{loop.recordings}/") for path in only] or sorted(records)
-    nights = [_last(records[path]) for path in named if records.get(path)][-NIGHTS:]
+    kept = [records[path].record for path in named if path in records]
+    kept = [one for one in kept if judge.segments(one, machine)][-NIGHTS:]
+    nights = [_last(judge.segments(one, machine)) for one in kept]
     floors = NIGHTS_FLOORS if len(nights) > 1 else PIECES_FLOORS
     if len(nights) == 1:
         nights = [
@@ -114,6 +119,7 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
             for u, y in nights[0]
             for part, other in zip(np.array_split(u, PIECES), np.array_split(y, PIECES), strict=True)
         ]
+        kept = _cut(kept[0])
     production = ProductionModel(judge.identified(folder), _samples(nights))
     try:
         # of recordings that are named, the champion's model is not made
@@ -125,9 +131,15 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
         "version": baseline.VERSION,
         "samples": _samples(nights),
         "own": own.to_json(),
-        "loop": [_closed_loop(night, machine) for night in nights],
+        "loop": [_closed_loop(one, machine) for one in kept],
         "steps": sensors.steps(nights).tolist(),
     }
+
+
+def _cut(record: Mapping[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
+    """The record's last LONGEST samples in PIECES."""
+    parts = {name: np.array_split(column[-LONGEST:], PIECES) for name, column in record.items()}
+    return [{name: columns[k] for name, columns in parts.items()} for k in range(PIECES)]
 
 
 def _without_each(machine: Plant, nights: Sequence[Segments]) -> list[ProductionModel]:
@@ -229,7 +241,7 @@ def look(
         if not segments:
             continue
         try:
-            drifted = _one(limits, drifted, path, segments, held, machine, nights, pending)
+            drifted = _one(limits, drifted, path, result.record, held, machine, nights, pending)
         except ValueError as error:
             drifted.notes.append(f"{path}: {error}")
     recent = {
@@ -327,19 +339,20 @@ def _one(
     limits: DriftLimits,
     drifted: LoopDrift,
     path: str,
-    segments: Segments,
+    record: dict[str, np.ndarray],
     held: ProductionReference,
     machine: Plant,
     nights: Nights,
     pending: set[str],
 ) -> LoopDrift:
     """The loop's drift with what one recording says; it joins `nights`."""
+    segments, closed_loop = _last(judge.segments(record, machine)), _closed_loop(record, machine)
     names = SignalNames([i.name for i in machine.inputs], [o.name for o in machine.outputs])
     mistake = mistakes.found(held.machine, segments, held.own, inputs=names.inputs, outputs=names.outputs)
     if mistake:
         drifted.quarantined[path] = quarantine(path, drifted.loop, f"{path}: {mistake.reason}")
-        segments = mistake.undone
-    measured = _measure(limits, segments, held, machine, names)
+        segments, closed_loop = mistake.undone, {}
+    measured = _measure(limits, segments, held, closed_loop, names)
     if not mistake and (doubt := _doubtful(measured, segments, held, names)):
         if doubt.wrong:
             drifted.quarantined[path] = quarantine(path, drifted.loop, f"{path}: {doubt.words}")
@@ -484,7 +497,11 @@ def _cannot_be(found: RecordingChange) -> bool:
 
 
 def _measure(
-    limits: DriftLimits, segments: Segments, held: ProductionReference, machine: Plant, names: SignalNames
+    limits: DriftLimits,
+    segments: Segments,
+    held: ProductionReference,
+    closed_loop: Mapping[str, list[list[float]]],
+    names: SignalNames,
 ) -> RecordingDrift:
     own, asked = held.own, drift.causes(held.machine.plant)
     record, explained = drift.explain_segments(
@@ -496,7 +513,7 @@ def _measure(
     if abs(air) > limits.ambient_degC:
         found.append(_air(limits, air, record, held))
     effect = drift.moved(record, own.changes, explained.changes) + abs(air)
-    loop = _loop(limits, _closed_loop(segments, machine), held, names, effect, asked=not found)
+    loop = _loop(limits, closed_loop, held, names, effect, asked=not found)
     figures = RecordingFigures(
         _parameters(record, explained, held, names), noise, loop.figures, loop.not_applicable
     )
@@ -679,25 +696,49 @@ def _parameters(
 # ---- the closed loop
 
 
-def _closed_loop(segments: Segments, machine: Plant) -> dict[str, list[list[float]]]:
-    """Offset of each output from its reference after the first third in °C, root mean square of each input
-    and its share of samples at a limit, both in percent: [figures, their standard deviations], from PARTS of
-    the record, which are longer than what a loop remembers."""
-    u, y = (np.concatenate([pair[k] for pair in segments]) for k in (0, 1))
-    reference, low, high = (
-        np.array([o.reference for o in machine.outputs]),
-        *np.array([(i.low, i.high) for i in machine.inputs]).T,
+def _closed_loop(record: Mapping[str, np.ndarray], machine: Plant) -> dict[str, list[list[float]]]:
+    """Offset of each output from its set-point where it is settled in °C, root mean square of each input and
+    its share of samples at a limit, both in percent, and the settled set-points in °C: [figures, their
+    standard deviations], from PARTS of the record, which are longer than what a loop remembers. Empty where
+    nothing is settled."""
+    u, y = (_last_of(record, signals) for signals in (machine.inputs, machine.outputs))
+    wanted = np.column_stack(
+        [
+            record.get(set_point_of(o.name), np.full(len(record["time_s"]), o.reference))[-LONGEST:]
+            for o in machine.outputs
+        ]
     )
-    late, limited = (y - reference)[len(y) // 3 :], 100.0 * ((u <= low + 1e-9) | (u >= high - 1e-9))
-    effort = np.sqrt((u**2).mean(axis=0))
+    settled = _settled(wanted)
+    if settled.sum() < PARTS * SHORTEST:
+        return {}
+    low, high = np.array([(i.low, i.high) for i in machine.inputs]).T
+    limited = 100.0 * ((u <= low + 1e-9) | (u >= high - 1e-9))
+    mean_square, deviation = np.array(_mean(u**2))
+    effort = np.sqrt(mean_square)
     return {
-        "offset_degC": _mean(late),
-        "effort_percent": [
-            effort.tolist(),
-            (np.array(_mean(u**2)[1]) / np.maximum(2 * effort, 1e-9)).tolist(),
-        ],
+        "offset_degC": _mean((y - wanted)[settled]),
+        "effort_percent": [effort.tolist(), (deviation / np.maximum(2 * effort, 1e-9)).tolist()],
         "at_limits_percent": _mean(limited),
+        "set_point_degC": [wanted[settled].mean(axis=0).tolist(), [0.0] * len(machine.outputs)],
     }
+
+
+def _last_of(record: Mapping[str, np.ndarray], signals: Sequence[PlantSignal]) -> np.ndarray:
+    """(T, k) of the last LONGEST samples; NaN where one is masked."""
+    columns = [np.where(record[f"{s.name}_masked"], np.nan, record[s.name]) for s in signals]
+    return np.column_stack(columns)[-LONGEST:].astype(float)
+
+
+def _settled(wanted: np.ndarray) -> np.ndarray:
+    """Where (T,) a loop has had time to reach its set-points (T, p): the last two thirds of a stretch of
+    SHORTEST samples or more in which none is changed. No set-point, or 0, is a heater that is off."""
+    changes = np.flatnonzero((np.diff(wanted, axis=0) != 0).any(axis=1)) + 1
+    edges = [0, *changes.tolist(), len(wanted)]
+    settled = np.zeros(len(wanted), bool)
+    for begin, end in itertools.pairwise(edges):
+        if end - begin >= SHORTEST:
+            settled[begin + (end - begin) // 3 : end] = True
+    return settled & (wanted > 0).all(axis=1)
 
 
 def _mean(values: np.ndarray) -> list[list[float]]:
@@ -730,15 +771,22 @@ def _loop(
     """Offset, effort and share at limits against the champion's own nights; not asked where those were not
     settled at the references. `effect` (p,) are the °C that the changes of the machine and the air around
     bring: what they explain is not counted again; `asked` is whether the machine is as it was."""
-    usual = {key: np.array([night[key] for night in held.loop]) for key in now}
+    nights = [night for night in held.loop if night]
+    if not now or not nights:
+        return LoopChanges({}, [], "no stretch is settled at a set-point")
+    usual = {key: np.array([night[key] for night in nights]) for key in now}
     offset = usual["offset_degC"][:, 0].mean(axis=0)
-    unsure = np.sqrt((usual["offset_degC"][:, 1] ** 2).mean(axis=0) / len(held.loop))
+    unsure = np.sqrt((usual["offset_degC"][:, 1] ** 2).mean(axis=0) / len(nights))
     if (np.abs(offset) > SETTLED * limits.offset_degC + 2 * unsure).any():
         return LoopChanges(
             {}, [], "the champion's own recordings are not of a loop settled at the references"
         )
     figures, causes = {}, []
+    aims = usual["set_point_degC"][:, 0]
+    elsewhere = np.abs(now["set_point_degC"][0] - aims).min(axis=0).max() > limits.offset_degC
     for key, (sentence, least, allowed) in _asked(limits, held, names, effect).items():
+        if elsewhere and key != "offset_degC":  # other set-points take other duties
+            continue
         of = names.outputs if key == "offset_degC" else names.inputs
         moved = _loop_shift(now[key], usual[key], least)
         for k, (name, by) in enumerate(zip(of, moved.value - moved.reference, strict=True)):
