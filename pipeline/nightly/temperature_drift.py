@@ -357,6 +357,8 @@ def _one(
         if doubt.wrong:
             drifted.quarantined[path] = quarantine(path, drifted.loop, f"{path}: {doubt.words}")
             return drifted
+        if not measured.found:
+            drifted.notes.append(f"{path}: {doubt.words}, and no single change explains it")
         measured = measured._replace(
             found=[one._replace(words=f"{one.words}; or {doubt.words}") for one in measured.found]
         )
