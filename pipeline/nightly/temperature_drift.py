@@ -120,8 +120,8 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
             for part, other in zip(np.array_split(u, PIECES), np.array_split(y, PIECES), strict=True)
         ]
         kept = _cut(kept[0])
-    production = ProductionModel(judge.identified(folder), _samples(nights))
     try:
+        production = ProductionModel(judge.identified(folder), _samples(nights))
         # of recordings that are named, the champion's model is not made
         own = baseline.measured(production, nights, floors, None if only else _without_each(machine, nights))
     except ValueError:
