@@ -1,7 +1,7 @@
 """A controller's files -> evidence: the temperature loop on a frozen panel of plants that nothing was learned
 from; any loop from a file of costs by case."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,7 +9,9 @@ import joblib
 import numpy as np
 
 from pipeline.deposition.tables import SCORES
+from pipeline.nightly import inputs
 from pipeline.nightly.decision import CaseCosts
+from pipeline.nightly.records import RecordShare
 from pipeline.nightly.settings import HoldOut, Nightly, NightlyLoop, PromotionRule
 from pipeline.recordings import recording_folders
 from pipeline.recordings.isolated import Budget
@@ -25,7 +27,7 @@ from pipeline.temperature.test_set import evaluation, panel
 from stages.ingest import Ingest, recording_wish
 from stages.tune_weights import read_models
 
-MEMO = Path(".beadline/panel")
+MEMO = Path("datasets/memo/panel")
 PAGE, EARLIER = "page", "varx_riccati"  # of nightly.holdout.controller
 
 
@@ -176,7 +178,7 @@ def frozen_panel(holdout: HoldOut) -> FrozenPanel:
         params.load(Tracking, "tracking"),
     )
     settings, tuning = params.load(Panel, "panel"), params.load(TuneWeights, "tune_weights")
-    simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
+    simulated = not _is_recorded()
     records = [] if simulated else _holdout_records(holdout, machine)
     truth = plant.baam()._replace(sample_time_s=machine.sample_time_s)
     nominal = [truth] if simulated else _panel_plants(records, machine)
@@ -337,6 +339,33 @@ def _holdout_records(h: HoldOut, machine: Machine) -> list[tuple[np.ndarray, np.
             "put one of the machine as commissioned there"
         )
     return [pair for pairs in record_segments(Path(h.recordings), machine).values() for pair in pairs]
+
+
+def measure_shares(settings: Nightly, paths: Sequence[str]) -> dict[str, RecordShare]:
+    """How much of each of these recordings of the temperature loop is learned from: samples with every
+    signal, in gapless stretches."""
+    folders = [loop.recordings for loop in settings.loops.values() if loop.judge == "temperature"]
+    own = [path for path in paths if folders and inputs.within(path, folders[0])]
+    if not own or not _is_recorded():
+        return {}
+    machine = recorded(params.load(Machine, "plant"), "datasets/ingest/record.parquet")
+    results = read_records(Path(folders[0]), machine, broken={})
+    within = {path: path.removeprefix(f"{folders[0]}/") for path in own}
+    return {path: _share(results[name], machine) for path, name in within.items() if name in results}
+
+
+def _share(result: RecordingTable, machine: Machine) -> RecordShare:
+    kinds, messages = result.quality["kind"], result.quality["message"]
+    cut = [float(str(message).partition(" %")[0]) for message in messages[kinds == "cut"]]
+    cut_percent = min(sum(cut), 99.0)
+    whole = len(result.record["time_s"]) / (1 - cut_percent / 100)
+    used = sum(np.isfinite(y).all(axis=1).sum() for _, y in segments(result.record, machine))
+    masked = np.mean([column for name, column in result.record.items() if name.endswith("_masked")])
+    return RecordShare(*(round(float(p), 1) for p in (100 * used / whole, 100 * masked, cut_percent)))
+
+
+def _is_recorded() -> bool:
+    return params.value("generate_probing.source", one_of=("simulated", "recordings")) == "recordings"
 
 
 def record_segments(
