@@ -105,6 +105,8 @@ def bring(folder: str, champion: Champion) -> None:
     path = FOLDER / f"{folder}.dvc"
     pointer = yaml.safe_dump({"outs": [dict(champion.folder)]}, sort_keys=False)
     artifacts.write_text(path, pointer)
+    if md5s(FOLDER / folder) == champion.files:
+        return
     try:
         dvc("checkout", "--quiet", "--force", str(path))
     except ValueError:
@@ -139,8 +141,7 @@ def follow() -> list[str]:
     for name, champion in stale.items():
         new = STATE / "production" / name
         with contextlib.chdir(COPY):
-            if md5s(FOLDER / name) != champion.files:
-                bring(name, champion)
+            bring(name, champion)
         shutil.rmtree(new, ignore_errors=True)
         shutil.copytree(COPY / FOLDER / name, new, copy_function=shutil.copyfile)
         for path in (*new.rglob("*"), new):

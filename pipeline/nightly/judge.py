@@ -16,14 +16,15 @@ from pipeline.nightly.settings import HoldOut, Nightly, NightlyLoop, PromotionRu
 from pipeline.recordings import recording_folders
 from pipeline.recordings.isolated import Budget
 from pipeline.recordings.recording_folders import RecordingTable
-from pipeline.setpoint import tables
+from pipeline.setpoint import tables as setpoint_tables
 from pipeline.store import artifacts, params
-from pipeline.temperature import plant
+from pipeline.temperature import plant, tables
 from pipeline.temperature.controllers import table, window
 from pipeline.temperature.controllers.problem import Design
 from pipeline.temperature.settings import Panel, Tracking, TuneWeights, recorded
 from pipeline.temperature.settings import Plant as Machine
 from pipeline.temperature.test_set import evaluation, panel
+from stages.identify_plant import IdentifyPlant, identify
 from stages.ingest import Ingest, recording_wish
 from stages.tune_weights import read_models
 
@@ -103,7 +104,7 @@ def _deposition(folder: Path) -> CaseCosts:
 def _setpoint(folder: Path) -> CaseCosts:
     """Of each case of each simulator that counts: the share of runs that the chosen controller does not
     settle, plus one point. Guards: the worst case, and the slowest."""
-    table = artifacts.read_table(folder / "evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD)
+    table = artifacts.read_table(folder / "evaluate_setpoint/scoreboard.parquet", setpoint_tables.SCOREBOARD)
     chosen = artifacts.read_json(folder / "evaluate_setpoint/choice.json")
     rows = [k for k, name in enumerate(table["controller"]) if name == chosen["name"] and table["counts"][k]]
     lost = {
@@ -181,7 +182,7 @@ def frozen_panel(holdout: HoldOut) -> FrozenPanel:
     simulated = not _is_recorded()
     records = [] if simulated else _holdout_records(holdout, machine)
     truth = plant.baam()._replace(sample_time_s=machine.sample_time_s)
-    nominal = [truth] if simulated else _panel_plants(records, machine)
+    nominal = [truth] if simulated else _panel_plants(Path(holdout.recordings), records, machine)
     spread = panel.spread_of(settings) if simulated else panel.spread_around(settings, nominal[0])
     rng = np.random.default_rng(holdout.seed)
     plants = plant.padded(panel.drawn(nominal, holdout.plants, spread, cells=simulated, rng=rng))
@@ -357,7 +358,7 @@ def measure_shares(settings: Nightly, paths: Sequence[str]) -> dict[str, RecordS
 def _share(result: RecordingTable, machine: Machine) -> RecordShare:
     kinds, messages = result.quality["kind"], result.quality["message"]
     cut = [float(str(message).partition(" %")[0]) for message in messages[kinds == "cut"]]
-    cut_percent = min(sum(cut), 99.0)
+    cut_percent = min(max(cut, default=0.0), 99.0)
     whole = len(result.record["time_s"]) / (1 - cut_percent / 100)
     used = sum(np.isfinite(y).all(axis=1).sum() for _, y in segments(result.record, machine))
     masked = np.mean([column for name, column in result.record.items() if name.endswith("_masked")])
@@ -423,29 +424,26 @@ def segments(
     return pairs
 
 
-def _panel_plants(records: list[tuple[np.ndarray, np.ndarray]], machine: Machine):
-    """The plants of the hold-out recordings: identified from them alone, and a bootstrap family around; kept,
-    since neither recordings nor method change from night to night."""
-    from pipeline.temperature.identification import model_choice as identification
-    from pipeline.temperature.identification import validation
-
-    p = params.read()["identify_plant"]
-    key = joblib.hash((records, p["max_order"], p["offset"], p["spread_plants"], p["seed"]))
-    path = MEMO / f"{key}.parquet"
-    if path.exists():
-        return plant.restored(artifacts.read_arrays(path, "holdout_plants", 1))
-    u, y = [a for a, _ in records], [b for _, b in records]
-    names = [i.name for i in machine.inputs]
-    u, _ = identification.within_limits(
-        u, tuple(zip(*((i.low, i.high) for i in machine.inputs), strict=True)), names=names
-    )
-    settings = identification.Settings(offset=p["offset"], max_order=p["max_order"])
-    fit = identification.identify(u, y, sample_time_s=machine.sample_time_s, settings=settings, names=names)
-    family = validation.bootstrap_spread(
-        u, y, fit, count=p["spread_plants"], order=fit.order, rng=np.random.default_rng(p["seed"])
-    )
-    plants = [plant.strictly_proper(one) for one in (fit.plant, *family)]
-    artifacts.write_arrays(path, "holdout_plants", 1, plant.stored(plants))
+def _panel_plants(
+    folder: Path, records: list[tuple[np.ndarray, np.ndarray]], machine: Machine
+) -> list[plant.Plant]:
+    """The plants of the hold-out recordings: identified from them alone by the method of the stage
+    `identify_plant`, and its spread around; kept, since neither changes from night to night."""
+    settings = params.load(IdentifyPlant, "identify_plant")
+    path = MEMO / f"{joblib.hash((records, settings.model_dump(), machine.model_dump()))}.parquet"
+    if not path.exists():
+        wish = recording_wish(params.load(Ingest, "ingest"), machine, params.load(Ingest, "ingest").mapping)
+        columns, _, _ = recording_folders.join([*read_records(folder, machine).values()], wish, strict=False)
+        schema, record = tables.record(machine.acting, machine.outputs), MEMO / "record.parquet"
+        names = [column.name for column in schema.columns]
+        artifacts.write_table(record, schema, {name: columns[name] for name in names})
+        try:
+            nominal, spread, _, _ = identify(settings, machine, str(record))
+        except ValueError as error:
+            why = str(error).removeprefix(f"{record}: ")
+            raise ValueError(f"{folder}: the hold-out records do not determine the machine: {why}") from None
+        plants = plant.padded([plant.strictly_proper(one) for one in (nominal, *spread)])
+        artifacts.write_arrays(path, "holdout_plants", 1, plant.stored(plants))
     return plant.restored(artifacts.read_arrays(path, "holdout_plants", 1))
 
 

@@ -102,7 +102,7 @@ def _run(now: datetime.datetime, render: reporting.Render) -> tuple[int, str]:
         work = work.fail(error)
     worktree.remove()  # on a full disk, what follows needs the room
     night = work.night._replace(seconds=round(time.monotonic() - clock, 1))
-    if settings and (overdue := watch.find_overdue(now, last.success, settings.watch_h)):
+    if last.success and settings and (overdue := watch.find_overdue(now, last.success, settings.watch_h)):
         night = night.noted(f"watch: {overdue}")
     memory = _remember(settings, last, work, hashes)
     return reporting.report(night, memory, settings, render)

@@ -102,7 +102,7 @@ def make(snapshot: Snapshot, sources: Iterable[str]) -> None:
     (COPY / memo).parent.mkdir(exist_ok=True)
     (COPY / memo).symlink_to(memo.resolve())
     with contextlib.chdir(COPY), contextlib.suppress(ValueError):  # what no cache has is made anew
-        checkout([*read_stages("dvc.lock")])
+        checkout([*read_stages("dvc.lock")], *map(str, Path("champion").glob("*.dvc")))
 
 
 def make_bare(snapshot: Snapshot) -> None:
@@ -114,11 +114,13 @@ def make_bare(snapshot: Snapshot) -> None:
     _share_dvc()
 
 
-def checkout(stages: Sequence[str]) -> None:
-    """The outs of these stages as dvc.lock has them. Raises ValueError if one is in no cache."""
+def checkout(stages: Sequence[str], *pointers: str) -> None:
+    """Brings the outs of these stages as dvc.lock has them, and those of these pointers. Raises ValueError
+    if one is in no cache."""
     wired, locked_stages = read_stages("dvc.yaml"), read_stages("dvc.lock")
-    if known := [name for name in stages if name in wired and name in locked_stages]:
-        dvc("checkout", "--quiet", "--force", *known)
+    known = [name for name in stages if name in wired and name in locked_stages]
+    if known or pointers:
+        dvc("checkout", "--quiet", "--force", *known, *pointers)
 
 
 def _share_dvc() -> None:

@@ -9,7 +9,7 @@ import yaml
 from pipeline.deposition.tables import SCORES
 from pipeline.nightly import judge, promoting
 from pipeline.nightly.decision import FIRST, KEPT, PROMOTED, CaseCosts, decide
-from pipeline.nightly.records import Champion, ChampionState, Installed, Night
+from pipeline.nightly.records import Champion, ChampionState, Night
 from pipeline.nightly.settings import HoldOut, Nightly, NightlyLoop
 from pipeline.report.nightly import page as nightly_page
 from pipeline.setpoint import tables
@@ -106,10 +106,10 @@ def test_a_champion_that_cannot_be_designed_is_named_and_stays(project, name, we
     with pytest.raises(judge.NotComparable, match=sentence) as refused:
         judge.judge(settings.loops["temperature"], settings).measure(Path("champion/temperature"))
     assert "\n" not in str(refused.value)
-    present = Champion("night-0001", "", "", Installed({"md5": "0"}))
+    present = Champion("night-0001", "", "", {"md5": "0"})
     state = ChampionState({"temperature": present})
     quiet = Night(2, "night-0002", "2030-01-01T02:00:00+00:00")
-    decided = promoting.decided(settings, "temperature", quiet, state, None).decision
+    decided = promoting.judge_loop(settings, "temperature", quiet, state, None).decision
     assert decided.decision == KEPT and "cannot be compared: " in decided.reasons[0]
 
 
