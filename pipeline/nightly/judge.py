@@ -87,7 +87,7 @@ _EXPECTED = "expected panel, cases with block and cost, and guards with value an
 
 def _deposition(folder: Path) -> CaseCosts:
     """Of each part program and material, none of which was trained on: the error of the flow that the chosen
-    composer leaves, as its stage scored it. Guard: the worst line."""
+    composer leaves, as its stage scored it. Guard: the worst line, if one is judged."""
     table = artifacts.read_table(folder / "compose_parts/scores.parquet", SCORES)
     rows = [k for k, chosen in enumerate(table["chosen"]) if chosen]
     cases = {
@@ -97,8 +97,10 @@ def _deposition(folder: Path) -> CaseCosts:
         )
         for k in rows
     }
-    worst = np.nanmax([table["worst_line_volume_percent"][k] for k in rows], initial=0.0)
-    return CaseCosts(joblib.hash(sorted(cases)), cases, {"worst_line_volume_percent": float(worst)})
+    # missing where no line is long enough, or its forecast is not judged: that is no good line
+    lines = [float(volume) for k in rows if np.isfinite(volume := table["worst_line_volume_percent"][k])]
+    guards = {"worst_line_volume_percent": max(lines)} if lines else {}
+    return CaseCosts(joblib.hash(sorted(cases)), cases, guards)
 
 
 def _setpoint(folder: Path) -> CaseCosts:

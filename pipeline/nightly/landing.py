@@ -124,8 +124,10 @@ def _bring_files(landing: Landing) -> list[str]:
     made = names("diff", "--name-only", "--no-renames", landing.before, landing.commit)
     gone = names("diff", "--name-only", "--no-renames", "--diff-filter=D", landing.before, landing.commit)
     staged = {*names("diff", "--cached", "--name-only", "--no-renames", landing.before)}
-    edited = {*names("diff", "--name-only", "--no-renames", landing.files)}
-    began = {*names("ls-tree", "-r", "--name-only", landing.files)}
+    # no reference holds that commit: a clean-up of git may have taken it
+    files = git("rev-parse", "-q", "--verify", f"{landing.files}^{{commit}}", check=False) or landing.before
+    edited = {*names("diff", "--name-only", "--no-renames", files)}
+    began = {*names("ls-tree", "-r", "--name-only", files)}
     # what git did not know when the night began, a new recording, lies there already
     bring = [name for name in made if name not in edited and (name in began or not Path(name).exists())]
     for name in (name for name in bring if name in gone):

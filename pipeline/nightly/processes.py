@@ -1,5 +1,6 @@
 """git and dvc as they are, run as children of the night."""
 
+import json
 import os
 import shlex
 import signal
@@ -149,7 +150,12 @@ def end_orphans() -> int:
 
 
 def remove_stale_locks() -> None:
-    """Removes lock files of git that a killed night left, if no git is at work in this repository."""
+    """Removes what a killed DVC left half written, and lock files of git if no git is at work here."""
+    rwlock = Path(".dvc/tmp/rwlock")
+    try:
+        json.loads(rwlock.read_bytes() if rwlock.exists() else b"{}")
+    except ValueError:  # half written: no later DVC would start
+        rwlock.unlink(missing_ok=True)
     if not Path("/proc/self").exists() or any(map(_works_here, Path("/proc").glob("[0-9]*"))):
         return
     folder = Path(git("rev-parse", "--git-common-dir"))

@@ -5,7 +5,6 @@ import datetime
 import json
 from typing import Any
 
-from pipeline.nightly import records
 from pipeline.nightly.processes import STATE, git
 from pipeline.nightly.records import DriftMemory, Night, Remembered, from_json, to_json
 from pipeline.store import artifacts
@@ -20,8 +19,8 @@ def last() -> Remembered:
     Raises ValueError if the file is broken."""
     if LAST.exists():
         memory = from_json(Remembered, artifacts.read_json(LAST))
-        if memory.success:
-            datetime.datetime.fromisoformat(memory.success)
+        if memory.success and not datetime.datetime.fromisoformat(memory.success).tzinfo:
+            raise ValueError(f"success {memory.success} has no time zone")
         return memory
     committed = git("show", f"HEAD:{METRICS}", check=False)
     fields = json.loads(committed or "{}")
@@ -60,7 +59,3 @@ def remember(memory: Remembered, night: Night) -> None:
     artifacts.write_json(LAST, to_json(memory))
     rows: list[Any] = [*map(to_json, nights()), to_json(night)]
     artifacts.write_json(NIGHTS, rows[-LONGEST_HISTORY:])
-
-
-def succeeded(night: Night) -> bool:
-    return night.outcome != records.FAILED and not night.lost

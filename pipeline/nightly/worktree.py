@@ -110,7 +110,9 @@ def make_bare(snapshot: Snapshot) -> None:
     remove()
     # hooks, as DVC's own, are of the checkout and not of the copy
     quiet = configure({"core.hooksPath": "/dev/null"})
-    git("worktree", "add", "--quiet", "--detach", "--force", str(COPY), snapshot.files, env=quiet)
+    # twice: also over one that was killed while git made it
+    twice = ("--force", "--force")
+    git("worktree", "add", "--quiet", "--detach", *twice, str(COPY), snapshot.files, env=quiet)
     _share_dvc()
 
 

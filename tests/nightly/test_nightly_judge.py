@@ -172,6 +172,13 @@ def test_a_part_s_chosen_composer_is_its_case(project):
     assert evidence.cases == {"a, A": ("a, A", 1.0), "b, A": ("b, A", 2.0)} and evidence.guards == {
         "worst_line_volume_percent": 0.5
     }
+    # a challenger whose lines are not judged has no worst line, and is no better for it
+    columns["worst_line_volume_percent"] = [np.nan, 90.0, np.nan]
+    artifacts.write_table("datasets/compose_parts/scores.parquet", SCORES, columns)
+    unjudged = judge._deposition(Path("datasets"))
+    assert unjudged.guards == {}
+    decision = decide(evidence, unjudged, project.rule, allowed={}, alarms=(), seed=1)
+    assert decision.decision == KEPT and "guard worst_line_volume_percent is inf" in str(decision.reasons)
 
 
 def test_a_setpoint_case_costs_the_runs_that_do_not_settle(project):
