@@ -85,12 +85,17 @@ def install(
 
 
 def hand_over(folder: str, beside: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Gives champion/<folder> to DVC, with what is to lie beside its files as JSON by name."""
     for name, content in beside.items():
         (FOLDER / folder / name).unlink(missing_ok=True)  # it may be a link into DVC's cache
         artifacts.write_json(FOLDER / folder / name, content)
     dvc("add", "--quiet", str(FOLDER / folder))
     pointer = yaml.safe_load((FOLDER / f"{folder}.dvc").read_text(encoding="utf-8"))["outs"][0]
-    return pointer, md5s(FOLDER / folder)
+    files = md5s(FOLDER / folder)
+    # what `bring` takes them from is on the disk before a commit names it
+    for md5 in {pointer["md5"], *files.values()}:
+        _write_through(Path(".dvc/cache/files/md5", md5[:2], md5[2:]))
+    return pointer, files
 
 
 def remove(folder: str) -> None:

@@ -63,16 +63,18 @@ def commit(paths: Sequence[str], message: str, parents: Sequence[str]) -> str:
     env = {"GIT_INDEX_FILE": str(index.resolve())} | configure(DURABLE)
     git("read-tree", parents[0], env=env, place=COPY)
     tracked = names("ls-files", "--", *paths, env=env, place=COPY)
-    there = [
+    existing = [
         path
         for path in paths
         if (COPY / path).exists() or any(name == path or inputs.within(name, path) for name in tracked)
     ]
     # nothing that git ignores, or that lies behind a link to another disk
-    there = [path for path in there if not git("check-ignore", path, check=False, place=COPY)]
-    there = [path for path in there if not any((COPY / p).is_symlink() for p in (path, *Path(path).parents))]
-    if there:
-        git("add", "-A", "--", *there, env=env, place=COPY)
+    existing = [path for path in existing if not git("check-ignore", path, check=False, place=COPY)]
+    existing = [
+        path for path in existing if not any((COPY / p).is_symlink() for p in (path, *Path(path).parents))
+    ]
+    if existing:
+        git("add", "-A", "--", *existing, env=env, place=COPY)
     tree = git("write-tree", env=env, place=COPY)
     index.unlink()
     if tree == git("rev-parse", f"{parents[0]}^{{tree}}"):
@@ -121,23 +123,27 @@ def finish() -> list[str]:
 
 def _bring_files(landing: Landing) -> list[str]:
     """Brings the files of the commit into the project and its index."""
-    made = names("diff", "--name-only", "--no-renames", landing.before, landing.commit)
-    gone = names("diff", "--name-only", "--no-renames", "--diff-filter=D", landing.before, landing.commit)
+    paths = names("diff", "--name-only", "--no-renames", landing.before, landing.commit)
+    deleted = names("diff", "--name-only", "--no-renames", "--diff-filter=D", landing.before, landing.commit)
     staged = {*names("diff", "--cached", "--name-only", "--no-renames", landing.before)}
     # no reference holds that commit: a clean-up of git may have taken it
     files = git("rev-parse", "-q", "--verify", f"{landing.files}^{{commit}}", check=False) or landing.before
     edited = {*names("diff", "--name-only", "--no-renames", files)}
-    began = {*names("ls-tree", "-r", "--name-only", files)}
+    tracked = {*names("ls-tree", "-r", "--name-only", files)}
     # what git did not know when the night began, a new recording, lies there already
-    bring = [name for name in made if name not in edited and (name in began or not Path(name).exists())]
-    for name in (name for name in bring if name in gone):
+    bring = [name for name in paths if name not in edited and (name in tracked or not Path(name).exists())]
+    for name in (name for name in bring if name in deleted):
         Path(name).unlink(missing_ok=True)
-    if written := [name for name in bring if name not in gone]:
-        _with_paths("checkout", "-q", landing.commit, paths=written)
-    if known := [name for name in made if name not in staged and name not in written]:
-        _with_paths("reset", "-q", landing.commit, paths=known)
-    left = [name for name in made if name in edited and not _is_brought(landing.commit, name)]
-    return [f"{name} was edited meanwhile and is left as it is" for name in left]
+    written = [name for name in bring if name not in deleted]
+    _call_with_paths("checkout", "-q", landing.commit, paths=written)
+    unstaged = [name for name in paths if name not in staged and name not in written]
+    _call_with_paths("reset", "-q", landing.commit, paths=unstaged)
+    differing = {*names("diff", "--name-only", "--no-renames", landing.commit)}
+    return [
+        f"{name} was edited meanwhile and is left as it is"
+        for name in paths
+        if name in edited and name in differing
+    ]
 
 
 def _changed_stages(landing: Landing) -> list[str]:
@@ -149,12 +155,9 @@ def _changed_stages(landing: Landing) -> list[str]:
     return [name for name, entry in after.items() if before.get(name) != entry]
 
 
-def _with_paths(*command: str, paths: Sequence[str]) -> None:
-    git(*command, "--pathspec-from-file=-", "--pathspec-file-nul", text="\0".join(paths), check=False)
-
-
-def _is_brought(commit: str, name: str) -> bool:
-    return not names("diff", "--name-only", commit, "--", name)
+def _call_with_paths(*command: str, paths: Sequence[str]) -> None:
+    if paths:
+        git(*command, "--pathspec-from-file=-", "--pathspec-file-nul", text="\0".join(paths))
 
 
 def set_aside(quarantined: Mapping[str, tuple[str, str, str]]) -> None:

@@ -8,7 +8,7 @@ import contextlib
 import datetime
 import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -176,6 +176,8 @@ def _check(settings: Nightly) -> None:
             "(nightly.least_free_mb); free some, or run ./run dvc gc --all-commits, which removes what no "
             "commit names"
         )
+    for name in ("dvc.yaml", "dvc.lock"):
+        reproducing.read_stages(name)
     if settings.promotion == "at_once":
         landing.get_branch()
     elif f"refs/heads/{settings.branch}" == git("symbolic-ref", "-q", "HEAD", check=False):
@@ -208,16 +210,16 @@ def _tell_idle(nights: int) -> str:
 
 def _find_new(digests: Mapping[str, str], loop: NightlyLoop, last: Remembered, name: str) -> dict[str, str]:
     """The recordings of a loop whose content was not there the night before."""
-    before = last.recordings.get(name, {}).values()
-    found = inputs.recordings(digests, loop).items()
-    return {path: content for path, content in found if content not in before}
+    seen_before = last.recordings.get(name, {}).values()
+    recordings = inputs.recordings(digests, loop).items()
+    return {path: content for path, content in recordings if content not in seen_before}
 
 
 def _compare(settings: Nightly, last: Remembered, work: Work, new: Mapping[str, Mapping[str, str]]) -> Work:
     """The night with its new recordings, or how long there was none."""
-    paths = {name: sorted(found) for name, found in new.items() if found}
+    paths = {name: sorted(recordings) for name, recordings in new.items() if recordings}
     night = work.night._replace(new_recordings=paths, idle=0 if paths else last.idle + 1)
-    unused = [_tell_unused(settings.loops[name], found) for name, found in paths.items()]
+    unused = [_tell_unused(settings.loops[name], recordings) for name, recordings in paths.items()]
     idle = [_tell_idle(night.idle)] if night.idle else []
     return work._replace(night=night.noted(*filter(None, unused), *idle))
 
@@ -273,7 +275,7 @@ def _list_moved(settings: Nightly, night: Night) -> dict[str, tuple[str, str, st
 # ---- the stages, and the judge
 
 
-def _learn(settings: Nightly, work: Work, hashes: inputs.Hashes, lineage) -> Work:
+def _learn(settings: Nightly, work: Work, hashes: inputs.Hashes, lineage: Callable[[], Lineage]) -> Work:
     """Runs the stages in the copy, and judges what they made. Raises ValueError if a recording changed
     meanwhile."""
     from pipeline.nightly import promoting
@@ -290,8 +292,8 @@ def _learn(settings: Nightly, work: Work, hashes: inputs.Hashes, lineage) -> Wor
     lost, notes = reproducing.reproduce(
         settings.loops, logs / f"{work.night.run}.log", limit_s=settings.longest_h * 3600
     )
-    now = inputs.contents(hashes, _list_places(settings))
-    if moved := sorted({name for name, _ in work.digests.items() ^ now.items()}):
+    digests = inputs.contents(hashes, _list_places(settings))
+    if moved := sorted({name for name, _ in work.digests.items() ^ digests.items()}):
         raise ValueError(
             f"{moved[0]} changed while the stages ran; nothing is changed, and the next night learns from it"
         )

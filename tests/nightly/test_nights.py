@@ -92,6 +92,17 @@ def test_a_new_untracked_recording_is_used_and_nothing_is_installed(project):
     assert "nothing new" in run()
 
 
+def test_what_is_promoted_is_on_the_disk_before_a_commit_names_it(project, monkeypatch):
+    written, write, move = [], champion._write_through, night.landing.move
+    monkeypatch.setattr(champion, "_write_through", lambda path: written.append(path.name) or write(path))
+    synced = []
+    monkeypatch.setattr(night.landing, "move", lambda *to: synced.extend(written) or move(*to))
+    project.record("new", [9.0, 9.0, 9.0])
+    run()
+    present = champion.read().champions["toy"]
+    assert {md5[2:] for md5 in (present.md5, *present.files.values())} <= {*synced}
+
+
 def test_what_lies_uncommitted_is_used_and_named(project):
     (project.folder / "learn.py").write_text(Path("learn.py").read_text() + "\nimport helper\n")
     (project.folder / "helper.py").write_text("assert True")
