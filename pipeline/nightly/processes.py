@@ -3,6 +3,7 @@
 import json
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 STATE = Path(".beadline")
 # in the environment of every child, so that the next night finds what a killed one left running
 TOKEN = "BEADLINE_NIGHT"
+FULL_MB = 10.0  # a disk with less room is the likeliest cause of what failed
 FALLBACK = {"GIT_AUTHOR_NAME": "beadline nightly", "GIT_AUTHOR_EMAIL": "nightly@beadline.invalid"}
 
 
@@ -93,15 +95,18 @@ def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> str:
         "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]),
         "PYTHONPATH": os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")]),
     }
-    with target.open("wb") as stream:
+    descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    try:
         child = subprocess.Popen(
             [sys.executable, "-m", "dvc", *arguments],
-            stdout=stream,
+            stdout=descriptor,
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
             start_new_session=True,
             env=env,
         )
+    finally:
+        os.close(descriptor)
     try:
         status = child.wait(limit_s)
     except subprocess.TimeoutExpired:
@@ -114,7 +119,10 @@ def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> str:
             child.wait()
     text = target.read_text(encoding="utf-8", errors="replace")
     if status:
-        raise ValueError(f"dvc {arguments[0]} failed: {find_sentence(text)}")
+        # on a full disk the log is cut off, and says nothing
+        free_mb = shutil.disk_usage(Path()).free / 1e6
+        full = f"; no space left on device ({free_mb:.1f} MB); free some" if free_mb < FULL_MB else ""
+        raise ValueError(f"dvc {arguments[0]} failed: {find_sentence(text)}{full}")
     return text
 
 

@@ -34,9 +34,9 @@ def tell(error: Exception, run: str) -> str:
         return sentence or type(error).__name__
     log = STATE / "logs" / f"{run}.log"
     try:
-        log.parent.mkdir(exist_ok=True)
-        with log.open("a", encoding="utf-8", errors="replace") as stream:
-            traceback.print_exception(error, file=stream)
+        before = log.read_bytes() if log.exists() else b""
+        lines = "".join(traceback.format_exception(error)).encode("utf-8", "replace")
+        artifacts.write_bytes(log, before + b"\n" + lines)
         where = f"its traceback is in {log}"
     except OSError as full:
         where = f"its traceback could not be written ({full.strerror})"

@@ -53,18 +53,18 @@ def locked() -> Generator[None]:
     STATE.mkdir(exist_ok=True)
     if not (STATE / ".gitignore").exists():
         artifacts.write_text(STATE / ".gitignore", "*\n")
-    with LOCK.open("a") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BusyError(
-                "another night is at work; this one changed nothing; run it again when that has ended"
-            ) from None
+    descriptor = os.open(LOCK, os.O_RDWR | os.O_CREAT)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         os.environ[TOKEN] = str(Path.cwd())
-        try:
-            yield
-        finally:
-            os.environ.pop(TOKEN, None)
+        yield
+    except BlockingIOError:
+        raise BusyError(
+            "another night is at work; this one changed nothing; run it again when that has ended"
+        ) from None
+    finally:
+        os.environ.pop(TOKEN, None)
+        os.close(descriptor)
 
 
 # ---- the copy
