@@ -87,6 +87,6 @@ def _change(state: ChampionState, change: Callable[[ChampionState], ChampionStat
         champion.write(state)
         paths = champion.paths(state)
     made = landing.commit(paths, message, [snapshot.head])
-    landing.land(Landing(made, landing.get_branch(), snapshot.head, snapshot.files, {}, {}), message)
+    landing.land(Landing(made, landing.get_branch(), snapshot.head, snapshot.files, {}), message)
     landing.finish()
     return made

@@ -200,12 +200,11 @@ def after_quarantine(
     return left | {path.as_posix(): hashes.of(path) for path in lists if path.is_file()}
 
 
-def bring_lists(settings: Nightly, copy: Path) -> None:
-    """Brings the lists of excluded recordings out of the copy, for a night whose commit stays on a branch."""
-    for loop in settings.loops.values():
-        path = Path(loop.recordings) / excluded.FILE
-        if loop.recordings and (copy / path).is_file():
-            artifacts.write_bytes(path, (copy / path).read_bytes())
+def read_lists(settings: Nightly, copy: Path) -> dict[str, str]:
+    """{path: text} of the lists of excluded recordings that lie in the copy."""
+    paths = [Path(loop.recordings) / excluded.FILE for loop in settings.loops.values() if loop.recordings]
+    lists = [path for path in paths if (copy / path).is_file()]
+    return {path.as_posix(): (copy / path).read_text(encoding="utf-8") for path in lists}
 
 
 # ---- what no commit holds

@@ -21,14 +21,16 @@ DURABLE = {"core.fsync": "all"}
 
 class Landing(NamedTuple):
     """A commit on its way into the project: the branch, and what it was before; the project's files when the
-    night began; tags by name; recordings that are set aside, {path: (loop, reason, digest)}."""
+    night began; tags by name; recordings that are set aside, {path: (loop, reason, digest)}; lists of those
+    that stay, {path: text}."""
 
     commit: str
     branch: str
     before: str
     files: str
     tags: Mapping[str, str]
-    quarantined: Mapping[str, tuple[str, str, str]]
+    quarantined: Mapping[str, tuple[str, str, str]] = {}
+    lists: Mapping[str, str] = {}
 
 
 def get_branch() -> str:
@@ -115,7 +117,7 @@ def finish() -> list[str]:
     if landing.branch == git("symbolic-ref", "-q", "HEAD", check=False):
         notes += _bring_files(landing)
         worktree.checkout(_changed_stages(landing))
-    set_aside(landing.quarantined)
+    set_aside(landing.quarantined, landing.lists)
     champion.follow()
     NOTE.unlink()
     return notes
@@ -160,8 +162,11 @@ def _call_with_paths(*command: str, paths: Sequence[str]) -> None:
         git(*command, "--pathspec-from-file=-", "--pathspec-file-nul", text="\0".join(paths))
 
 
-def set_aside(quarantined: Mapping[str, tuple[str, str, str]]) -> None:
-    """Sets the project's recordings aside, each if it is still what was judged."""
+def set_aside(quarantined: Mapping[str, tuple[str, str, str]], lists: Mapping[str, str]) -> None:
+    """Sets the project's recordings aside, each if it is still what was judged, and lists those that stay."""
+    for path, text in lists.items():
+        if not Path(path).exists() or Path(path).read_text(encoding="utf-8") != text:
+            artifacts.write_text(path, text)
     for path, (loop, reason, digest) in quarantined.items():
         if Path(path).exists() and artifacts.sha256(path) == digest:
             inputs.move_aside(path, loop, reason)

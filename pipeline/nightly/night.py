@@ -352,8 +352,7 @@ def _land(
             tracked += champion.paths(work.state)
         if not by_branch or night.promoted:
             artifacts.write_json(METRICS, night.metrics(work.state))
-    if by_branch:
-        inputs.bring_lists(settings, COPY)
+    lists = inputs.read_lists(settings, COPY)
     head = landing.check_head(snapshot, [*places, "dvc.lock", str(champion.FILE), str(champion.FOLDER)])
     outcome = f"promoted {', '.join(night.promoted)}" if night.promoted else "kept the champions"
     message = f"nightly {night.run}: {outcome}\n\n" + "\n".join(night.reasons)
@@ -365,7 +364,7 @@ def _land(
         or {*names("diff", "--name-only", head, made)} <= {METRICS}
         or (by_branch and not night.promoted)
     ):
-        landing.set_aside(quarantined)
+        landing.set_aside(quarantined, lists)
         yield work
         return
     work = work._replace(night=night._replace(commit=made))
@@ -377,10 +376,10 @@ def _land(
             "the night after puts it into production"
         )
         yield work
-        landing.set_aside(quarantined)
+        landing.set_aside(quarantined, lists)
         return
     tags = {f"refs/tags/production/{loop}/{night.run}": made for loop in night.promoted}
-    landing.land(Landing(made, landing.get_branch(), head, snapshot.files, tags, quarantined), message)
+    landing.land(Landing(made, landing.get_branch(), head, snapshot.files, tags, quarantined, lists), message)
     yield work
     yield work.noted(*landing.finish())
 
