@@ -23,7 +23,6 @@ from pipeline.nightly.records import (
     RecordingFigures,
 )
 from pipeline.nightly.settings import DriftLimits, NightlyLoop
-from pipeline.recordings.recording_folders import RecordingTable
 from pipeline.store import artifacts, params
 from pipeline.temperature.identification import model_choice
 from pipeline.temperature.settings import Plant, PlantSignal, recorded
@@ -237,7 +236,6 @@ def look(
         if _stand_still(drifted, path, result.record, held, machine):
             continue
         segments = _last(judge.segments(result.record, machine))
-        drifted.notes.append(_used(path, result, segments))
         if not segments:
             continue
         try:
@@ -268,19 +266,6 @@ def _estimates(night: Mapping[str, Sequence[float]]) -> dict[str, Estimate]:
 
 def _rounded(night: Mapping[str, Estimate]) -> dict[str, list[float]]:
     return {key: [round(float(part), 6) for part in estimate] for key, estimate in night.items()}
-
-
-def _used(path: str, result: RecordingTable, segments: Segments) -> str:
-    """What share of a recording is held against production: the samples of its last LONGEST that have every
-    signal; and what is masked or cut."""
-    kinds, messages = result.quality["kind"], result.quality["message"]
-    cut = [str(message).partition(" %")[0] for message in messages[kinds == "cut"]]
-    whole = len(result.record["time_s"]) / (1 - min(float(cut[0]) / 100 if cut else 0.0, 0.99))
-    used = sum(int(np.isfinite(y).all(axis=1).sum()) for _, y in segments)
-    masked = np.mean([column for name, column in result.record.items() if name.endswith("_masked")])
-    why = [f"{cut[0]} % cut: damaged rows"] if cut else []
-    why += [f"{100 * masked:.0f} % masked"] if masked >= 0.005 else []
-    return f"used {100 * used / whole:.0f} % of {Path(path).name}" + (f" ({', '.join(why)})" if why else "")
 
 
 def _least(limits: DriftLimits, explained: Explanation, held: ProductionReference, names: SignalNames) -> str:

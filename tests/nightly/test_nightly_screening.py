@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.nightly import drift, inputs, screening, temperature_drift
-from pipeline.nightly.records import SENSOR, Alarm
+from pipeline.nightly import drift, inputs, judge, screening, temperature_drift
+from pipeline.nightly.records import SENSOR, Alarm, RecordShare
 from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Nightly
 from pipeline.recordings import plain_files
@@ -465,9 +465,12 @@ def test_good_shifts_with_coarse_sensors_are_no_dead_sensors(look):
 def test_a_night_says_what_it_used_and_what_would_have_shown(look):
     shift = nights.a_night(1, 730)
     silent = np.where((np.arange(600) >= 300) & (np.arange(600) < 320), np.nan, shift["sensor_2"])
-    used, shown = look(shift | {"sensor_2": silent}).drift.notes
+    (shown,) = look(shift | {"sensor_2": silent}).drift.notes
+    nights.write(NEW, shift | {"sensor_2": silent})
+    share = judge.measure_shares(params.load(Nightly, "nightly"), [str(NEW)])[str(NEW)]
+    NEW.unlink()
     # 20 of 600 samples lack a signal, one of four
-    assert used == "used 97 % of new.csv (1 % masked)"
+    assert share == RecordShare(used_percent=96.7, masked_percent=0.8, cut_percent=0.0)
     found = re.fullmatch(
         r"new.csv would have shown a gain of heater_\d from (\S+) % on "
         r"and an offset of sensor_\d from (\S+) °C on",
