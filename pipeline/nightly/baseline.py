@@ -68,16 +68,23 @@ def _lists(fields: Scatter | MachineChanges) -> dict[str, Any]:
     return {name: np.asarray(value).tolist() for name, value in fields._asdict().items()}
 
 
-def measured(machine: ProductionModel, nights: Sequence[Segments], floors: Floors) -> Baseline:
-    """The baseline of a champion's nights. Raises ValueError where they are too short."""
+def measured(
+    machine: ProductionModel,
+    nights: Sequence[Segments],
+    floors: Floors,
+    without: Sequence[ProductionModel] | None = None,
+) -> Baseline:
+    """The baseline of a champion's nights, each held against the model of `without` that was identified
+    without it (None: the champion's own). Raises ValueError where they are too short."""
     plant, together = machine.plant, [pair for night in nights for pair in night]
     loose, none = _loose(machine, together), MachineChanges.none(plant.m, plant.p)
     record = drift.record(machine, together, loose)
     errors = drift.left(record, none)
     causes = drift.causes(plant)
     changes = drift.explain(record, none, dict.fromkeys(causes, OWN / 2 * float(errors @ errors))).changes
-    scale = _scale(machine, nights, loose, changes, floors)
-    records = [rested(machine, night, scale, changes) for night in nights]
+    models = without or [machine] * len(nights)
+    scale = _scale(models, nights, loose, changes, floors)
+    records = [rested(model, night, scale, changes) for model, night in zip(models, nights, strict=True)]
     fits = [drift.alone(one, changes) for one in records]
     rest = [drift.left(one, changes) for one in records]
     noises = [noise(drift.by_output(one, e)) for one, e in zip(records, rest, strict=True)]
@@ -130,7 +137,7 @@ def _loose(machine: ProductionModel, together: Segments) -> Scatter:
 
 
 def _scale(
-    machine: ProductionModel,
+    models: Sequence[ProductionModel],
     nights: Sequence[Segments],
     loose: Scatter,
     changes: MachineChanges,
@@ -138,7 +145,7 @@ def _scale(
 ) -> Scatter:
     """How honest nights scatter, from these. Of a few nights a standard deviation is small by chance:
     Student's quantile for it, and the new night's own share."""
-    records = [rested(machine, night, loose, changes) for night in nights]
+    records = [rested(model, night, loose, changes) for model, night in zip(models, nights, strict=True)]
     airs, own = zip(*(drift.levels(record, changes) for record in records), strict=True)
     count = len(nights)
     wider = scipy.stats.t.ppf(0.841, count - 1) * np.sqrt(1 + 1 / count) if count > 1 else 1.0

@@ -15,16 +15,11 @@ def nightly(arguments: argparse.Namespace, *, render: "Render") -> None:
     """The nightly job: new recordings, dvc repro, judge, promote or keep. Exit status 0: promoted, kept, or
     nothing new; 1: the night or one loop failed; a loop that failed keeps its controller, the others are
     judged; 3: drift alarm; 4: done, but recordings were set aside; 75: refused, another night is at work."""
-    from pipeline.nightly import accepting, merging, night, reporting
+    from pipeline.nightly import by_hand, night, reporting
 
     if arguments.accept_drift:
-        print(printable(accepting.accept(*arguments.accept_drift)))
+        print(printable(by_hand.accept(*arguments.accept_drift)))
         return
-    if arguments.merge_only:
-        print(printable(merging.merge(arguments.merge_only)))
-        return
-    if arguments.merge:
-        print(printable(merging.merge(arguments.merge)))
     status, summary = reporting.watchdog() if arguments.watch else night.nightly(render)
     print(printable(summary), file=sys.stderr if status else sys.stdout)
     sys.exit(status)
@@ -33,9 +28,9 @@ def nightly(arguments: argparse.Namespace, *, render: "Render") -> None:
 def rollback(arguments: argparse.Namespace) -> None:
     """Put an earlier champion back into production, bit by bit: that
     of RUN, or the one before the present one."""
-    from pipeline.nightly import night
+    from pipeline.nightly import by_hand
 
-    print(printable(night.rollback(arguments.of, arguments.loop)))
+    print(printable(by_hand.rollback(arguments.of, arguments.loop)))
 
 
 def add(commands, render: "Render") -> None:
@@ -45,12 +40,6 @@ def add(commands, render: "Render") -> None:
         "--watch",
         action="store_true",
         help="only look whether the last success is older than nightly.watch_h",
-    )
-    command.add_argument(
-        "--merge", metavar="BRANCH", default="", help="merge the nights of another branch first"
-    )
-    command.add_argument(
-        "--merge-only", metavar="BRANCH", default="", help="merge them, and end without a night"
     )
     command.add_argument(
         "--accept-drift",

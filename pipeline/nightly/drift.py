@@ -31,7 +31,7 @@ BLOCKS = 12  # into which a record is cut for the variance of an estimate
 SHORTEST = 96  # samples of a record that is asked
 COURSE = 8  # degree of the polynomial that the air around may follow within a segment
 LONGEST_DELAY = 64  # samples; a longer one is a mistake of the record
-GAIN_LIMITS, RATE_LIMITS, OFFSET_LIMITS = (-0.98, 0.6), (-0.6, 1.5), (-60.0, 60.0)
+GAIN_LIMITS, RATE_LIMITS, OFFSET_LIMITS = (-0.98, 1.0), (-0.6, 1.5), (-60.0, 60.0)
 STEPS = {"gain": 0.02, "time constant": 0.02, "delay": 1.0, "late sensor": 1.0, "offset": 0.1}
 SURE = 5.0  # a cause is named from so many sigmas on, squared: what it explains beyond the noise
 # of what the first cause explains, a second one must explain so much: less is what the model gets wrong of it
@@ -44,6 +44,7 @@ SEASON = 20.0  # °C by which another season's air may differ
 UNLIKE = 0.1  # share of the air's course by which one output may follow it otherwise than the others
 CAUSE = 10.0  # by so much more must a cause explain than another season's air
 MOST = 3  # causes of one record
+LOST = 0.04  # share of what is asked of a heater: if its cap takes less, nobody needs to know
 
 Segments = Sequence[tuple[np.ndarray, np.ndarray]]
 
@@ -536,8 +537,8 @@ def _capped(record: DriftRecord, changes: MachineChanges, cause: DriftCause, bef
 
 
 def above(segments: Segments, j: int, level: float) -> float:
-    """Percent of the samples in which more than `level` is asked of input j."""
-    return 100 * float(np.mean(np.concatenate([u[:, j] for u, _ in segments]) > level))
+    """Percent of the samples in which so much more than `level` is asked of input j that it matters."""
+    return 100 * float(np.mean(np.concatenate([u[:, j] for u, _ in segments]) > (1 + LOST) * level))
 
 
 def moved(record: DriftRecord, changes: MachineChanges, now: MachineChanges) -> np.ndarray:

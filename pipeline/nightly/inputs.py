@@ -11,7 +11,8 @@ from pathlib import Path
 
 import yaml
 
-from pipeline.nightly.processes import LITERAL, changed, names
+from pipeline.nightly.processes import changed, names
+from pipeline.nightly.reproducing import outs_of, read_stages
 from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.recordings import excluded, plain_files
 from pipeline.recordings.formats import METADATA
@@ -23,28 +24,15 @@ QUARANTINE = Path("datasets/quarantine")
 def sources() -> list[str]:
     """Files and folders that dvc.yaml's stages read and none of them writes;
     the files of parameters and dvc.yaml with them."""
-    stages = yaml.safe_load(Path("dvc.yaml").read_text(encoding="utf-8")).get("stages", {})
-    made = {
-        name
-        for stage in stages.values()
-        for kind in ("outs", "metrics", "plots")
-        for out in stage.get(kind, [])
-        for name in _names(out)
-    }
-    read = {dep for stage in stages.values() for dep in stage.get("deps", [])} | {
-        params.FILE,
-        params.EXPERT,
-        "dvc.yaml",
-    }
+    stages = read_stages("dvc.yaml").values()
+    made = [out for stage in stages for out in outs_of(stage)]
+    read = {dep for stage in stages for dep in stage.get("deps", [])}
+    read |= {params.FILE, params.EXPERT, "dvc.yaml"}
     return sorted(
         dep
         for dep in read
         if not any(f"{dep}/".startswith(f"{out}/") for out in made) and dep != "reports/accepted.json"
     )
-
-
-def _names(out: str | Mapping) -> list[str]:
-    return [out] if isinstance(out, str) else list(out)
 
 
 class Hashes:
@@ -147,8 +135,7 @@ def within(name: str, folder: str) -> bool:
 
 def quarantine(path: str, loop: str, reason: str) -> str:
     """Sets a recording aside, a file or a bag, and returns the reason. It is moved, unchanged, to
-    datasets/quarantine, where no stage looks and git does not either, its reason beside it; nothing there is
-    overwritten. What git or DVC keeps stays where it is, and is listed in excluded.yaml of its loop's
+    datasets/quarantine. What git or DVC keeps stays where it is, and is listed in excluded.yaml of its loop's
     folder. A copy that is not complete stays: it is another recording when it is."""
     if plain_files.wait_until_still([Path(path)]):
         return f"{reason} (it is still being written: it stays, and is looked at again)"
@@ -156,6 +143,13 @@ def quarantine(path: str, loop: str, reason: str) -> str:
         folder = params.load(Nightly, "nightly").loops[loop].recordings
         excluded.exclude(path, folder, reason)
         return f"{reason} ({kept_by} keeps it: it stays, and is listed in {folder}/{excluded.FILE})"
+    move_aside(path, loop, reason)
+    return reason
+
+
+def move_aside(path: str, loop: str, reason: str) -> None:
+    """Moves a recording to datasets/quarantine, where no stage looks and git does not either, its reason
+    beside it; nothing there is overwritten."""
     name, aside = Path(path), QUARANTINE / loop
     aside.mkdir(parents=True, exist_ok=True)
     if not (QUARANTINE / ".gitignore").exists():
@@ -164,13 +158,12 @@ def quarantine(path: str, loop: str, reason: str) -> str:
     target = next(aside / free_name for free_name in free if not (aside / free_name).exists())
     shutil.move(path, target)
     artifacts.write_text(f"{target}.reason.txt", reason + "\n")
-    return reason
 
 
 def keeper(path: Path) -> str:
     """Who has a version of what lies here: git, DVC, or nobody, which is empty."""
     try:
-        if names("ls-files", "--", str(path), env=LITERAL):
+        if names("ls-files", "--", str(path)):
             return "git"
     except ValueError:  # no repository, or the path leads out of it
         return ""
@@ -205,6 +198,13 @@ def after_quarantine(
     }
     lists = [Path(loop.recordings) / excluded.FILE for loop in loops.values() if loop.recordings]
     return left | {path.as_posix(): hashes.of(path) for path in lists if path.is_file()}
+
+
+def read_lists(settings: Nightly, copy: Path) -> dict[str, str]:
+    """{path: text} of the lists of excluded recordings that lie in the copy."""
+    paths = [Path(loop.recordings) / excluded.FILE for loop in settings.loops.values() if loop.recordings]
+    lists = [path for path in paths if (copy / path).is_file()]
+    return {path.as_posix(): (copy / path).read_text(encoding="utf-8") for path in lists}
 
 
 # ---- what no commit holds

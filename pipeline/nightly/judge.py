@@ -1,7 +1,7 @@
 """A controller's files -> evidence: the temperature loop on a frozen panel of plants that nothing was learned
 from; any loop from a file of costs by case."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,23 +9,26 @@ import joblib
 import numpy as np
 
 from pipeline.deposition.tables import SCORES
+from pipeline.nightly import inputs
 from pipeline.nightly.decision import CaseCosts
+from pipeline.nightly.records import RecordShare
 from pipeline.nightly.settings import HoldOut, Nightly, NightlyLoop, PromotionRule
 from pipeline.recordings import recording_folders
 from pipeline.recordings.isolated import Budget
 from pipeline.recordings.recording_folders import RecordingTable
-from pipeline.setpoint import tables
+from pipeline.setpoint import tables as setpoint_tables
 from pipeline.store import artifacts, params
-from pipeline.temperature import plant
+from pipeline.temperature import plant, tables
 from pipeline.temperature.controllers import table, window
 from pipeline.temperature.controllers.problem import Design
 from pipeline.temperature.settings import Panel, Tracking, TuneWeights, recorded
 from pipeline.temperature.settings import Plant as Machine
 from pipeline.temperature.test_set import evaluation, panel
+from stages.identify_plant import IdentifyPlant, identify
 from stages.ingest import Ingest, recording_wish
 from stages.tune_weights import read_models
 
-MEMO = Path(".beadline/panel")
+MEMO = Path("datasets/memo/panel")
 PAGE, EARLIER = "page", "varx_riccati"  # of nightly.holdout.controller
 
 
@@ -84,7 +87,7 @@ _EXPECTED = "expected panel, cases with block and cost, and guards with value an
 
 def _deposition(folder: Path) -> CaseCosts:
     """Of each part program and material, none of which was trained on: the error of the flow that the chosen
-    composer leaves, as its stage scored it. Guard: the worst line."""
+    composer leaves, as its stage scored it. Guard: the worst line, if one is judged."""
     table = artifacts.read_table(folder / "compose_parts/scores.parquet", SCORES)
     rows = [k for k, chosen in enumerate(table["chosen"]) if chosen]
     cases = {
@@ -94,14 +97,16 @@ def _deposition(folder: Path) -> CaseCosts:
         )
         for k in rows
     }
-    worst = np.nanmax([table["worst_line_volume_percent"][k] for k in rows], initial=0.0)
-    return CaseCosts(joblib.hash(sorted(cases)), cases, {"worst_line_volume_percent": float(worst)})
+    # missing where no line is long enough, or its forecast is not judged: that is no good line
+    lines = [float(volume) for k in rows if np.isfinite(volume := table["worst_line_volume_percent"][k])]
+    guards = {"worst_line_volume_percent": max(lines)} if lines else {}
+    return CaseCosts(joblib.hash(sorted(cases)), cases, guards)
 
 
 def _setpoint(folder: Path) -> CaseCosts:
     """Of each case of each simulator that counts: the share of runs that the chosen controller does not
     settle, plus one point. Guards: the worst case, and the slowest."""
-    table = artifacts.read_table(folder / "evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD)
+    table = artifacts.read_table(folder / "evaluate_setpoint/scoreboard.parquet", setpoint_tables.SCOREBOARD)
     chosen = artifacts.read_json(folder / "evaluate_setpoint/choice.json")
     rows = [k for k, name in enumerate(table["controller"]) if name == chosen["name"] and table["counts"][k]]
     lost = {
@@ -176,10 +181,10 @@ def frozen_panel(holdout: HoldOut) -> FrozenPanel:
         params.load(Tracking, "tracking"),
     )
     settings, tuning = params.load(Panel, "panel"), params.load(TuneWeights, "tune_weights")
-    simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
+    simulated = not _is_recorded()
     records = [] if simulated else _holdout_records(holdout, machine)
     truth = plant.baam()._replace(sample_time_s=machine.sample_time_s)
-    nominal = [truth] if simulated else _panel_plants(records, machine)
+    nominal = [truth] if simulated else _panel_plants(Path(holdout.recordings), records, machine)
     spread = panel.spread_of(settings) if simulated else panel.spread_around(settings, nominal[0])
     rng = np.random.default_rng(holdout.seed)
     plants = plant.padded(panel.drawn(nominal, holdout.plants, spread, cells=simulated, rng=rng))
@@ -339,6 +344,33 @@ def _holdout_records(h: HoldOut, machine: Machine) -> list[tuple[np.ndarray, np.
     return [pair for pairs in record_segments(Path(h.recordings), machine).values() for pair in pairs]
 
 
+def measure_shares(settings: Nightly, paths: Sequence[str]) -> dict[str, RecordShare]:
+    """How much of each of these recordings of the temperature loop is learned from: samples with every
+    signal, in gapless stretches."""
+    folders = [loop.recordings for loop in settings.loops.values() if loop.judge == "temperature"]
+    own = [path for path in paths if folders and inputs.within(path, folders[0])]
+    if not own or not _is_recorded():
+        return {}
+    machine = recorded(params.load(Machine, "plant"), "datasets/ingest/record.parquet")
+    results = read_records(Path(folders[0]), machine, broken={})
+    within = {path: path.removeprefix(f"{folders[0]}/") for path in own}
+    return {path: _share(results[name], machine) for path, name in within.items() if name in results}
+
+
+def _share(result: RecordingTable, machine: Machine) -> RecordShare:
+    kinds, messages = result.quality["kind"], result.quality["message"]
+    cut = [float(str(message).partition(" %")[0]) for message in messages[kinds == "cut"]]
+    cut_percent = min(max(cut, default=0.0), 99.0)
+    whole = len(result.record["time_s"]) / (1 - cut_percent / 100)
+    used = sum(np.isfinite(y).all(axis=1).sum() for _, y in segments(result.record, machine))
+    masked = np.mean([column for name, column in result.record.items() if name.endswith("_masked")])
+    return RecordShare(*(round(float(p), 1) for p in (100 * used / whole, 100 * masked, cut_percent)))
+
+
+def _is_recorded() -> bool:
+    return params.value("generate_probing.source", one_of=("simulated", "recordings")) == "recordings"
+
+
 def record_segments(
     folder: Path, machine: Machine, *, broken: dict[str, str] | None = None
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
@@ -394,29 +426,26 @@ def segments(
     return pairs
 
 
-def _panel_plants(records: list[tuple[np.ndarray, np.ndarray]], machine: Machine):
-    """The plants of the hold-out recordings: identified from them alone, and a bootstrap family around; kept,
-    since neither recordings nor method change from night to night."""
-    from pipeline.temperature.identification import model_choice as identification
-    from pipeline.temperature.identification import validation
-
-    p = params.read()["identify_plant"]
-    key = joblib.hash((records, p["max_order"], p["offset"], p["spread_plants"], p["seed"]))
-    path = MEMO / f"{key}.parquet"
-    if path.exists():
-        return plant.restored(artifacts.read_arrays(path, "holdout_plants", 1))
-    u, y = [a for a, _ in records], [b for _, b in records]
-    names = [i.name for i in machine.inputs]
-    u, _ = identification.within_limits(
-        u, tuple(zip(*((i.low, i.high) for i in machine.inputs), strict=True)), names=names
-    )
-    settings = identification.Settings(offset=p["offset"], max_order=p["max_order"])
-    fit = identification.identify(u, y, sample_time_s=machine.sample_time_s, settings=settings, names=names)
-    family = validation.bootstrap_spread(
-        u, y, fit, count=p["spread_plants"], order=fit.order, rng=np.random.default_rng(p["seed"])
-    )
-    plants = [plant.strictly_proper(one) for one in (fit.plant, *family)]
-    artifacts.write_arrays(path, "holdout_plants", 1, plant.stored(plants))
+def _panel_plants(
+    folder: Path, records: list[tuple[np.ndarray, np.ndarray]], machine: Machine
+) -> list[plant.Plant]:
+    """The plants of the hold-out recordings: identified from them alone by the method of the stage
+    `identify_plant`, and its spread around; kept, since neither changes from night to night."""
+    settings = params.load(IdentifyPlant, "identify_plant")
+    path = MEMO / f"{joblib.hash((records, settings.model_dump(), machine.model_dump()))}.parquet"
+    if not path.exists():
+        wish = recording_wish(params.load(Ingest, "ingest"), machine, params.load(Ingest, "ingest").mapping)
+        columns, _, _ = recording_folders.join([*read_records(folder, machine).values()], wish, strict=False)
+        schema, record = tables.record(machine.acting, machine.outputs), MEMO / "record.parquet"
+        names = [column.name for column in schema.columns]
+        artifacts.write_table(record, schema, {name: columns[name] for name in names})
+        try:
+            nominal, spread, _, _ = identify(settings, machine, str(record))
+        except ValueError as error:
+            why = str(error).removeprefix(f"{record}: ")
+            raise ValueError(f"{folder}: the hold-out records do not determine the machine: {why}") from None
+        plants = plant.padded([plant.strictly_proper(one) for one in (nominal, *spread)])
+        artifacts.write_arrays(path, "holdout_plants", 1, plant.stored(plants))
     return plant.restored(artifacts.read_arrays(path, "holdout_plants", 1))
 
 

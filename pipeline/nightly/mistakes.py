@@ -1,9 +1,10 @@
 """Mistakes of recording: a record that is not what it says it is.
 
 Swapped sensors or inputs, °F or K for °C, a factor of ten, a clock that is shifted between inputs and
-outputs. One is believed only where undoing it explains the record BETTER times as well as taking it at its
-word, what is left is no more than on an honest record, and no change of the machine explains as much: a
-drifted machine must never be silenced as a badly written record.
+outputs. One is believed if undoing it explains the record BETTER times as well as taking it at its word, what
+is left is no more than on an honest record, and no change of the machine explains as much: a drifted machine
+must never be silenced as a badly written record. If the machine would have had to change as none can, the
+likeliest mistake is named all the same.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -19,6 +20,9 @@ BETTER = 30.0  # by which the mean squared error must fall
 HONEST = 2.0  # of the largest of the champion's own records: what an honest one may leave
 AS_MUCH = 2.0  # a change of the machine that leaves up to so much more explains as much
 ROOM = drift.RESTLESS._replace(another_season=False)  # the air is not 48 °C warmer: that is °F
+ALIKE = (
+    2.0  # what is left with two mistakes undone that a record does not tell apart: heaters / 10, sensors * 10
+)
 FARTHEST = 128  # samples by which a clock is looked for
 
 Undo = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -32,6 +36,14 @@ class Mistake(NamedTuple):
     undone: Segments
     better: float
 
+    @property
+    def reason(self) -> str:
+        """Why the record is set aside, in one sentence."""
+        return (
+            f"{self.words}: undone, the record fits the champion's model {self.better:.0f} times better; "
+            "mend it and put it back"
+        )
+
 
 def found(
     machine: ProductionModel,
@@ -44,24 +56,46 @@ def found(
     """The mistake that was made in writing a record; None where it is what it says, or where a change of the
     machine explains it as well. Raises ValueError where the record is too short."""
     asked = drift.record(machine, segments, own.scale, ROOM)
-    as_is, honest = baseline.misfit(asked, own.changes), HONEST * float(max(own.misfit.max(), 1.0))
+    as_is = baseline.misfit(asked, own.changes)
     if as_is < BETTER:
         return None
-    left, words, undone = _best(machine, segments, own, inputs, outputs)
-    if left > honest or as_is < BETTER * left:
+    mistake = likeliest(machine, segments, own, inputs=inputs, outputs=outputs)
+    left = as_is / mistake.better
+    if left > honest(own) or mistake.better < BETTER:
         return None
     samples = sum(int(one.measured.sum()) for one in asked.segments)
     every_delay = drift.DriftCause("delay", -1)  # which is a shifted clock by another name
     explained = [fit.explained for fit in drift.alone(asked, own.changes) if fit.cause != every_delay]
     if as_is - max(explained) / samples < AS_MUCH * left:
         return None
+    return mistake
+
+
+def honest(own: Baseline) -> float:
+    """The mean squared error that an honest record may leave, in that of the champion's own."""
+    return HONEST * float(max(own.misfit.max(), 1.0))
+
+
+def likeliest(
+    machine: ProductionModel,
+    segments: Segments,
+    own: Baseline,
+    *,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+) -> Mistake:
+    """Of all mistakes the one that explains the record best with it undone, be that well or not. Raises
+    ValueError where the record is too short."""
+    as_is = baseline.misfit(drift.record(machine, segments, own.scale, ROOM), own.changes)
+    left, words, undone = _best(machine, segments, own, inputs, outputs)
     return Mistake(words, undone, as_is / left)
 
 
 def _best(
     machine: ProductionModel, segments: Segments, own: Baseline, inputs: Sequence[str], outputs: Sequence[str]
 ) -> tuple[float, str, Segments]:
-    """Of every mistake: what is left with it undone, its words, and the record undone; the least first."""
+    """Of the mistake that leaves least with it undone: what is left, its words with those of mistakes that
+    leave as little, and the record undone."""
 
     def left(undone: Segments) -> float:
         try:
@@ -74,7 +108,10 @@ def _best(
         undone = [undo(u, y) for u, y in segments]
         tried.append((left(undone), words, undone))
     tried.append(_clock(segments, left, machine.plant.sample_time_s))
-    return min(tried, key=lambda one: one[0])
+    tried.sort(key=lambda one: one[0])
+    least, words, undone = tried[0]
+    as_good = [other for cost, other, _ in tried[1:3] if cost < ALIKE * least]
+    return least, ", or ".join([words, *as_good]), undone
 
 
 def _swaps(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo]]:

@@ -4,80 +4,68 @@ Exit status 0: promoted, kept, or nothing new; 1: the night failed; 3: drift ala
 aside; 75: another night is at work.
 """
 
+import contextlib
 import datetime
+import shutil
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import stages
 from pipeline.nightly import (
-    branches,
     champion,
-    guarding,
     inputs,
+    landing,
     records,
     remembered,
     reporting,
     reproducing,
     watch,
+    worktree,
 )
-from pipeline.nightly.processes import STATE, changed, check_attached, commit, dvc, git
-from pipeline.nightly.records import ROLLED_BACK, ChampionState, Lineage, LoopDecision, Night
-from pipeline.nightly.remembered import METRICS, DriftMemory, Remembered
+from pipeline.nightly.landing import Landing
+from pipeline.nightly.processes import dvc, git, names
+from pipeline.nightly.records import ChampionState, DriftMemory, Lineage, Night, Remembered
+from pipeline.nightly.remembered import METRICS
 from pipeline.nightly.settings import Nightly, NightlyLoop
+from pipeline.nightly.worktree import COPY, Snapshot
 from pipeline.store import artifacts, params
 
-OK, FAILED, BUSY = reporting.OK, reporting.FAILED, reporting.BUSY
-DRIFTED, QUARANTINED = reporting.DRIFTED, reporting.QUARANTINED
-# the loop whose recordings are learned from where this parameter says so
+# the loop whose recordings are learned from if this parameter says so
 RECORDED = "recordings"
 SOURCES = {
     "temperature": "generate_probing.source",
     "deposition": "train_ilc.source",
     "setpoint": "train_classifier.source",
 }
+CUT_PERCENT = 5.0  # of a recording; more is a note
 
 
-class Job(NamedTuple):
-    """What a night works by: the settings, what is remembered of the night before, hashes of files that have
-    not changed since. `restarted`: the inputs have changed once already while the stages ran."""
-
-    settings: Nightly
-    last: Remembered
-    hashes: inputs.Hashes
-    restarted: bool = False
-
-
-class NightWork(NamedTuple):
-    """A night under way: its record, what it is made from {path: digest}, new recordings {loop: {path:
-    digest}}, the memory of drift, and what is in production.
-
-    `moved` are inputs that changed while the stages ran. `lost` is {loop: why its stages failed}, `off` are
-    the loops that section `loops` switches off. `done`: no further step follows.
-    """
+class Work(NamedTuple):
+    """A night under way: its record, and what the next one must remember of drift. What it is made from
+    {path: digest}, what is in production and what will be, and the loops that are switched off."""
 
     night: Night
     memory: DriftMemory
     digests: Mapping[str, str] = {}
-    new: Mapping[str, Mapping[str, str]] = {}
     state: ChampionState = ChampionState()
-    moved: tuple[str, ...] = ()
-    lost: Mapping[str, str] = {}
-    off: tuple[str, ...] = ()
-    done: bool = False
+    off: Sequence[str] = ()
 
-    def ended(self, outcome: str, *reasons: str) -> "NightWork":
-        return self._replace(night=self.night.ended(outcome, *reasons), done=True)
+    def noted(self, *notes: str) -> "Work":
+        return self._replace(night=self.night.noted(*notes))
 
-    def failed(self, error: Exception) -> "NightWork":
-        """The night after what ended it. A night that has made its commit stays what it was, and is repeated
-        in the morning after."""
-        why = reporting.told(error, self.night.run)
+    def ended(self, outcome: str, *reasons: str) -> "Work":
+        return self._replace(night=self.night.ended(outcome, *reasons))
+
+    def fail(self, error: Exception) -> "Work":
+        """The night after what ended it. One that has made its commit stays what it was, and the next one
+        finishes it."""
+        why = reporting.tell(error, self.night.run)
         if self.night.commit:
-            return self._replace(night=self.night._replace(unpushed=True).noted(why), done=True)
-        nothing = self.night._replace(decisions={}, promoted=(), branch="")
-        return self._replace(night=nothing).ended(records.FAILED, why)
+            return self._replace(night=self.night._replace(unpushed=True).noted(why))
+        night = self.night._replace(decisions={}, promoted=(), branch="")
+        return self._replace(night=night.ended(records.FAILED, why))
 
 
 def nightly(render: reporting.Render, now: datetime.datetime | None = None) -> tuple[int, str]:
@@ -85,411 +73,371 @@ def nightly(render: reporting.Render, now: datetime.datetime | None = None) -> t
     whatever happens."""
     started = now or datetime.datetime.now(datetime.UTC)
     try:
-        with guarding.locked():
-            return _night(started, render)
-    except guarding.BusyError as busy:
-        return BUSY, f"nightly: refused: {busy}"
+        with worktree.locked():
+            return _run(started, render)
+    except worktree.BusyError as busy:
+        return reporting.BUSY, f"nightly: refused: {busy}"
     except Exception as error:  # nothing may end a night without a word
         return reporting.last_resort(error, started)
 
 
-def _night(now: datetime.datetime, render: reporting.Render) -> tuple[int, str]:
+def _run(now: datetime.datetime, render: reporting.Render) -> tuple[int, str]:
     clock = time.monotonic()
-    last, aside = remembered.opened()
-    night = Night(last.night + 1, f"night-{last.night + 1:04d}", watch.stamp(now))
-    settings, refused = reporting.settings_or_known(last, night.run)
+    notes = remembered.set_broken_aside()
+    last = remembered.last()
+    night = Night(last.night + 1, f"night-{last.night + 1:04d}", watch.stamp(now)).noted(*notes)
     if last.success and now < datetime.datetime.fromisoformat(last.success):
         night = night.noted(
             f"the clock was set back: it is {night.when}, and the last success was at {last.success}"
         )
-    overdue = watch.overdue(now, last.success, settings.watch_h) if last.success and settings else ""
-    job = Job(settings, last, inputs.Hashes(last.hashes)) if settings else None
-    work, mended = _mended(NightWork(night, last.drift), [*aside, *refused])
-    if mended:
-        guarding.RUNNING.touch()
-    if job and not work.done:
-        work = _worked(job, work)
-    if work.night.outcome == records.FAILED:
-        guarding.RESERVE.unlink(missing_ok=True)  # on a full disk, what follows is written from it
+    work, settings, hashes = Work(night, last.drift), None, inputs.Hashes(last.hashes)
+    try:
+        try:
+            settings = params.load(Nightly, "nightly")
+        finally:  # what a killed night left is put right whatever the parameters are
+            work = work.noted(*worktree.clear_killed(), *landing.finish(), *champion.follow())
+        for step in _work(settings, last, hashes, work):
+            work = step
+    except Exception as error:  # refused in a sentence, or a mistake of this program
+        work = work.fail(error)
+    worktree.remove()  # on a full disk, what follows needs the room
     night = work.night._replace(seconds=round(time.monotonic() - clock, 1))
-    night = night.noted(f"watch: {overdue}") if overdue else night
-    tonight = _to_remember(job, work) if job else last._replace(night=night.number)
-    status, summary = reporting.report(night, tonight, settings, render)
-    if mended:
-        guarding.RUNNING.unlink(missing_ok=True)
-    return status, summary
+    if last.success and settings and (overdue := watch.find_overdue(now, last.success, settings.watch_h)):
+        night = night.noted(f"watch: {overdue}")
+    memory = _remember(settings, last, work, hashes)
+    return reporting.report(night, memory, settings, render)
 
 
-# ---- the night, step by step
+def _work(settings: Nightly, last: Remembered, hashes: inputs.Hashes, work: Work) -> Iterator[Work]:
+    """The work after each step. What a step raises ends the night, which keeps what the steps before it came
+    to."""
+    work, settings = _leave_out_loops(settings, work)
+    if not settings.loops:
+        yield work.ended(records.NOTHING_NEW, "section loops switches off every loop")
+        return
+    yield work
+    _check(settings)
+    places = _list_places(settings)
+    digests = inputs.contents(hashes, places)
+    if _is_known(digests, last):
+        yield _end_idle(work._replace(digests=digests), last)
+        return
+    snapshot, uncommitted = worktree.take(), inputs.uncommitted(settings)
+    worktree.make(snapshot, digests)
+    state = champion.read()
+    with contextlib.chdir(COPY):
+        for name, one in state.folders.items():
+            champion.bring(name, one)
+        work = work._replace(digests=inputs.contents(hashes, places), state=state)
+        new = {name: _find_new(work.digests, loop, last, name) for name, loop in settings.loops.items()}
+        work = _compare(settings, last, work, new)
+        yield work
+        work = _screen(settings, work, new, hashes)
+    quarantined = _list_moved(settings, work.night)
+    yield work
+    if _is_known(work.digests, last):
+        work = work.ended(records.QUARANTINED, "all that was new is quarantined")
+    else:
+        with contextlib.chdir(COPY):
+            work = _learn(settings, work, hashes, lambda: _lineage(settings, work.digests, uncommitted))
+        yield work
+    work = work.noted(*_tell_uncommitted(uncommitted))
+    for step in _land(settings, work, state, snapshot, places, quarantined):
+        work = step
+        yield work
+    yield _push(settings, work)
 
 
-def _mended(work: NightWork, broken: Sequence[str]) -> tuple[NightWork, bool]:
-    """What a killed night left, put right; whether that could be done. The night ends where a file that it
-    works by is broken, which its sentences say."""
-    whole, broken = True, list(broken)
-    try:
-        guarding.unmerged()
-    except Exception as error:
-        return work.ended(records.FAILED, *broken, reporting.told(error, work.night.run)), False
-    for mend in (guarding.broken_champion, guarding.mend):
-        try:
-            said = mend()
-        except Exception as error:
-            whole = False
-            broken.append(reporting.told(error, work.night.run))
-            continue
-        if mend is guarding.broken_champion:
-            broken += said
-        else:
-            work = work._replace(night=work.night.noted(*said))
-    return (work.ended(records.FAILED, *dict.fromkeys(broken)) if broken else work), whole
+# ---- before the stages
 
 
-def _worked(job: Job, work: NightWork) -> NightWork:
-    """The night itself. Each step returns the work with more in it; one that fails ends the night, which
-    keeps what the steps before it came to."""
-    steps = (
-        *(_ready, _unchanged, _compared, _screened, _learned, _put_back, _restarted),
-        *(_committed, _pushed),
-    )
-    for step in steps:
-        if work.done:
-            break
-        try:
-            work = step(_without(job, (*work.lost, *work.off)), work)
-        except Exception as error:  # refused in a sentence, or a mistake of this program
-            work = work.failed(error)
-            # until the stages have run nothing is changed, and after that production may be
-            work = _undone(work) if step in (_committed, _pushed) else work
-    return work
-
-
-def _undone(work: NightWork, *undo: Callable[[], list[str]]) -> NightWork:
-    """What a failed night changed is put back, production last."""
-    for back in (*undo, champion.as_committed):
-        try:
-            work = work._replace(night=work.night.noted(*back()))
-        except Exception as error:
-            work = work._replace(night=work.night.noted(reporting.told(error, work.night.run)))
-    return work
-
-
-def _without(job: Job, names: Collection[str]) -> Job:
-    """The job without these loops: nothing of them is judged or committed."""
-    if not names:
-        return job
-    loops = {name: loop for name, loop in job.settings.loops.items() if name not in names}
-    return job._replace(settings=job.settings.model_copy(update={"loops": loops}))
-
-
-def _ready(job: Job, work: NightWork) -> NightWork:
-    """Checks every section of the parameters before a stage runs, and leaves out the loops that are switched
-    off."""
-    guarding.ready(job.settings.least_free_mb)
-    branches.check(job.settings)
+def _leave_out_loops(settings: Nightly, work: Work) -> tuple[Work, Nightly]:
+    """The work and the settings without the loops that section `loops` switches off. Checks every section of
+    the parameters."""
     switches = stages.check_parameters()
-    off = tuple(name for name in job.settings.loops if not switches.get(name, True))
+    off = [name for name in settings.loops if not switches.get(name, True)]
     if not off:
-        return work
+        return work, settings
+    loops = {name: loop for name, loop in settings.loops.items() if name not in off}
     alarms = tuple(alarm for alarm in work.memory.alarms if alarm.loop not in off)
-    night = work.night.noted(f"no part of the night, by section loops: {', '.join(off)}")
-    work = work._replace(off=off, memory=work.memory._replace(alarms=alarms), night=night)
-    if len(off) == len(job.settings.loops):
-        return work.ended(records.NOTHING_NEW, "section loops switches off every loop")
-    return work
-
-
-def _unchanged(job: Job, work: NightWork) -> NightWork:
-    """Reads what the night is made from; the night ends where that is what the last one was made from."""
-    digests = inputs.contents(job.hashes, _places(job.settings))
-    work = work._replace(digests=digests)
-    if not _nothing_new(digests, job.last):
-        return work
-    return work.ended(
-        records.QUARANTINED if work.night.quarantined else records.NOTHING_NEW,
-        "no recording, parameter or code has changed since the last night",
+    work = work._replace(off=off, memory=work.memory._replace(alarms=alarms))
+    return (
+        work.noted(f"no part of the night, by section loops: {', '.join(off)}"),
+        settings.model_copy(update={"loops": loops}),
     )
 
 
-def _compared(job: Job, work: NightWork) -> NightWork:
-    """The recordings of each loop whose content was not there the night before."""
-    new = {
-        name: _new(work.digests, loop, job.last.recordings.get(name, {}))
-        for name, loop in job.settings.loops.items()
-    }
-    paths = {name: sorted(recordings) for name, recordings in new.items() if recordings}
-    night = work.night._replace(new_recordings=paths)
-    unused = [_unused(job.settings.loops[name], recordings) for name, recordings in paths.items()]
-    idle = [] if paths else ["no new recording: drift was not measured"]
-    return work._replace(new=new, night=night.noted(*filter(None, unused), *idle))
+def _check(settings: Nightly) -> None:
+    """Raises ValueError if the night cannot end well."""
+    free = shutil.disk_usage(Path()).free / 1e6
+    if free < settings.least_free_mb:
+        raise ValueError(
+            f"the disk has {free:.0f} MB left, but a night needs {settings.least_free_mb:g} MB "
+            "(nightly.least_free_mb); free some, or run ./run dvc gc --all-commits, which removes what no "
+            "commit names"
+        )
+    for name in ("dvc.yaml", "dvc.lock"):
+        reproducing.read_stages(name)
+    if settings.promotion == "at_once":
+        landing.get_branch()
+    elif f"refs/heads/{settings.branch}" == git("symbolic-ref", "-q", "HEAD", check=False):
+        raise ValueError(
+            f"nightly.branch: expected a branch apart from the one that is in production, found "
+            f"{settings.branch}, which is checked out; git switch to the other one, or name another branch"
+        )
 
 
-def _screened(job: Job, work: NightWork) -> NightWork:
-    """New recordings held against the champions; the night ends where all that was new is quarantined."""
-    from pipeline.nightly import screening  # it takes seconds to import, and so does what judges
-
-    state, night = champion.read(), work.night
-    screened = screening.look(job.settings, state.champions, work.new, work.memory, night=night.number)
-    quarantined = {**night.quarantined, **screened.drift.quarantined}
-    night = night.noted(*screened.drift.notes)
-    digests = inputs.after_quarantine(work.digests, quarantined, job.settings.loops, job.hashes)
-    work = work._replace(
-        night=night._replace(screened=True, drift=screened.drift, quarantined=quarantined),
-        memory=screened.memory,
-        digests=digests,
-        state=state,
-    )
-    if _nothing_new(digests, job.last):
-        return work.ended(records.QUARANTINED, "all that was new is quarantined")
-    return work
-
-
-def _learned(job: Job, work: NightWork) -> NightWork:
-    """Runs the stages, and judges what they made. What a refused run changed is put back."""
-    guarding.remember_before()
-    try:
-        # the pages of tonight show tonight's drift, and judge by it
-        artifacts.write_json(METRICS, work.night.metrics(work.state))
-        lost, notes = _reproduce(job.settings, work.night.run)
-        # what came or changed meanwhile may be in some stages and not in others, and
-        # nobody has looked whether it is fit to learn from
-        now = inputs.contents(job.hashes, _places(job.settings))
-        moved = tuple(sorted({name for name, _ in work.digests.items() ^ now.items()}))
-        if moved and (job.restarted or any(name.endswith(".py") for name in moved)):
-            raise ValueError(
-                f"{moved[0]} changed{' again' if job.restarted else ''} while the stages ran; "
-                "start the night when nothing is recorded or edited"
-            )
-        if moved:
-            return work._replace(moved=moved)
-        work = work._replace(lost=lost, night=work.night.noted(*notes))
-        return _with_lost(_judge(_without(job, work.lost), work))
-    except Exception as error:
-        return _undone(work.failed(error), guarding.back_to_before)
-
-
-def _with_lost(work: NightWork) -> NightWork:
-    """The night's record with the loops whose stages failed, told first; their champions stay."""
-    lost = {
-        name: LoopDecision(records.FAILED, [f"its champion stays: {why}"]) for name, why in work.lost.items()
-    }
-    night = work.night._replace(decisions={**lost, **work.night.decisions})
-    reasons = [f"{name}: {decision.decision}, {decision.reasons[0]}" for name, decision in lost.items()]
-    return work._replace(night=night.ended(night.outcome, *reasons, *night.reasons))
-
-
-def _put_back(job: Job, work: NightWork) -> NightWork:
-    """Where inputs changed while the stages ran: all as it was before the night, and nothing decided."""
-    if not work.moved:
-        return work
-    night = work.night.noted(
-        *guarding.back_to_before(),
-        f"{', '.join(work.moved[:3])} changed while the stages ran: the night began once again",
-    )
-    return work._replace(night=night.without_measurement(), memory=job.last.drift)
-
-
-def _restarted(job: Job, work: NightWork) -> NightWork:
-    """The whole night once more, by the parameters as they are now."""
-    if not work.moved:
-        return work
-    again = job._replace(settings=params.load(Nightly, "nightly"), restarted=True)
-    return _worked(again, NightWork(work.night, work.memory))._replace(done=True)
-
-
-def _places(settings: Nightly) -> list[str]:
+def _list_places(settings: Nightly) -> list[str]:
     """All that a night is made from."""
     recordings = [loop.recordings for loop in settings.loops.values() if loop.recordings]
     return [*inputs.sources(), settings.holdout.recordings, *recordings]
 
 
-def _nothing_new(digests: Mapping[str, str], last: Remembered) -> bool:
+def _is_known(digests: Mapping[str, str], last: Remembered) -> bool:
     return inputs.digest(digests) == last.inputs and not last.unpushed
 
 
-def _new(digests: Mapping[str, str], loop: NightlyLoop, before: Mapping[str, str]) -> dict[str, str]:
+def _end_idle(work: Work, last: Remembered) -> Work:
+    night = work.night._replace(idle=last.idle + 1).noted(_tell_idle(last.idle + 1))
+    reason = "no recording, parameter or code has changed since the last night"
+    return work._replace(night=night.ended(records.NOTHING_NEW, reason))
+
+
+def _tell_idle(nights: int) -> str:
+    running = f" for {nights} nights" if nights > 1 else ""
+    return f"no new recording{running}: drift was not measured"
+
+
+def _find_new(digests: Mapping[str, str], loop: NightlyLoop, last: Remembered, name: str) -> dict[str, str]:
     """The recordings of a loop whose content was not there the night before."""
-    return {
-        name: content
-        for name, content in inputs.recordings(digests, loop).items()
-        if content not in before.values()
-    }
+    seen_before = last.recordings.get(name, {}).values()
+    recordings = inputs.recordings(digests, loop).items()
+    return {path: content for path, content in recordings if content not in seen_before}
 
 
-def _unused(loop: NightlyLoop, recordings: Sequence[str]) -> str:
-    """That new recordings of a loop are not learned from, and what would change that; empty where they
-    are."""
-    section, _, key = SOURCES.get(loop.judge, "").partition(".")
+def _compare(settings: Nightly, last: Remembered, work: Work, new: Mapping[str, Mapping[str, str]]) -> Work:
+    """The night with its new recordings, or how long there was none."""
+    paths = {name: sorted(recordings) for name, recordings in new.items() if recordings}
+    night = work.night._replace(new_recordings=paths, idle=0 if paths else last.idle + 1)
+    unused = [_tell_unused(settings.loops[name], recordings) for name, recordings in paths.items()]
+    idle = [_tell_idle(night.idle)] if night.idle else []
+    return work._replace(night=night.noted(*filter(None, unused), *idle))
+
+
+def _tell_unused(loop: NightlyLoop, recordings: Sequence[str]) -> str:
+    """That new recordings of a loop are not learned from, and what would change that; empty if they are."""
+    dotted = SOURCES.get(loop.judge, "")
+    section, _, key = dotted.partition(".")
     source = params.read().get(section, {}).get(key, RECORDED)
     if source == RECORDED:
         return ""
     first, more = ", ".join(recordings[:3]), f" and {len(recordings) - 3} more" if len(recordings) > 3 else ""
-    dotted = f"{section}.{key}"
     return (
         f"{first}{more} {'is' if len(recordings) == 1 else 'are'} not used, for {dotted} is {source}; "
         f"set {dotted}: {RECORDED} in {params.home(dotted)} to learn from what is recorded"
     )
 
 
-def _reproduce(settings: Nightly, run: str) -> tuple[Mapping[str, str], Sequence[str]]:
-    """{loop: why its stages failed}, and notes."""
+def _screen(
+    settings: Nightly, work: Work, new: Mapping[str, Mapping[str, str]], hashes: inputs.Hashes
+) -> Work:
+    """New recordings held against the champions; what cannot be learned from is out of the copy then."""
+    from pipeline.nightly import judge, screening  # they take seconds to import
+
+    night = work.night
+    screened = screening.look(settings, work.state.champions, new, work.memory, night=night.number)
+    quarantined = screened.drift.quarantined
+    digests = inputs.after_quarantine(work.digests, quarantined, settings.loops, hashes)
+    used = judge.measure_shares(
+        settings, [p for found in new.values() for p in found if p not in quarantined]
+    )
+    cut = [
+        f"{path}: {share.cut_percent:.0f} % of it is cut, {share.used_percent:.0f} % is used"
+        for path, share in used.items()
+        if share.cut_percent > CUT_PERCENT
+    ]
+    night = night._replace(drift=screened.drift, quarantined=quarantined, used=used)
+    return work._replace(
+        night=night.noted(*screened.drift.notes, *cut), memory=screened.memory, digests=digests
+    )
+
+
+def _list_moved(settings: Nightly, night: Night) -> dict[str, tuple[str, str, str]]:
+    """{recording: (loop, reason, digest)} of what is to be set aside in the project."""
+    return {
+        path: (name, reason, artifacts.sha256(path))
+        for name in settings.loops
+        for path, reason in night.drift.of(name).quarantined.items()
+        if Path(path).exists() and not (COPY / path).exists()
+    }
+
+
+# ---- the stages, and the judge
+
+
+def _learn(settings: Nightly, work: Work, hashes: inputs.Hashes, lineage: Callable[[], Lineage]) -> Work:
+    """Runs the stages in the copy, and judges what they made. Raises ValueError if a recording changed
+    meanwhile."""
+    from pipeline.nightly import promoting
+
+    # the pages of tonight show tonight's drift, and judge by it
+    artifacts.write_json(METRICS, work.night.metrics(work.state))
     for loop in settings.loops.values():
         # large recordings are DVC's: the pointer beside the folder moves with it
         if loop.recordings and Path(f"{loop.recordings}.dvc").exists():
             dvc("add", "--quiet", loop.recordings)
-    for old in sorted((STATE / "logs").glob("*.log"))[:-60]:
+    logs = Path("..").resolve() / "logs"
+    for old in sorted(logs.glob("*.log"))[:-60]:
         old.unlink()
-    return reproducing.reproduce(settings.loops, run, limit_s=settings.longest_h * 3600)
-
-
-# ---- champion and challenger
-
-
-def _judge(job: Job, work: NightWork) -> NightWork:
-    """Each loop's challenger before the rules of its page and against its champion, and what is promoted."""
-    from pipeline.nightly import promoting
-
-    night, state = promoting.judged(
-        job.settings, work.night, work.state, lineage=lambda: _lineage(job.settings, work.digests)
+    lost, notes = reproducing.reproduce(
+        settings.loops, logs / f"{work.night.run}.log", limit_s=settings.longest_h * 3600
     )
-    return work._replace(night=night, state=state)
+    digests = inputs.contents(hashes, _list_places(settings))
+    if moved := sorted({name for name, _ in work.digests.items() ^ digests.items()}):
+        raise ValueError(
+            f"{moved[0]} changed while the stages ran; nothing is changed, and the next night learns from it"
+        )
+    loops = {name: loop for name, loop in settings.loops.items() if name not in lost}
+    rest = settings.model_copy(update={"loops": loops})
+    night, state = promoting.judge_all(rest, work.night.noted(*notes), work.state, lineage=lineage)
+    failed = {
+        name: records.LoopDecision(records.FAILED, [f"its champion stays: {why}"])
+        for name, why in lost.items()
+    }
+    reasons = [f"{name}: failed, {decision.reasons[0]}" for name, decision in failed.items()]
+    night = night._replace(decisions=failed | dict(night.decisions))
+    return work._replace(night=night.ended(night.outcome, *reasons, *night.reasons), state=state)
 
 
-def _lineage(settings: Nightly, made_from: Mapping[str, str]) -> Lineage:
-    """What the challengers were made from: the commit, what lay
-    uncommitted on it, dvc.lock, parameters and recordings."""
+def _lineage(settings: Nightly, digests: Mapping[str, str], uncommitted: Sequence[str]) -> Lineage:
+    """What the challengers were made from: the commit, what lay uncommitted on it, dvc.lock, parameters and
+    recordings."""
+    files = [name for name in (params.FILE, params.EXPERT) if artifacts.exists(name)]
     return Lineage(
         commit=git("rev-parse", "HEAD"),
-        uncommitted=inputs.uncommitted(settings),
+        uncommitted=tuple(uncommitted),
         dvc_lock=artifacts.sha256("dvc.lock"),
-        params={
-            name: artifacts.sha256(name) for name in (params.FILE, params.EXPERT) if artifacts.exists(name)
-        },
-        recordings={name: inputs.recordings(made_from, loop) for name, loop in settings.loops.items()},
+        params={name: artifacts.sha256(name) for name in files},
+        recordings={name: inputs.recordings(digests, loop) for name, loop in settings.loops.items()},
     )
 
 
-# ---- the commit, which is the promotion
-
-
-def _committed(job: Job, work: NightWork) -> NightWork:
-    """The night's commit: of HEAD; or on a branch beside what waits there, where promotions wait."""
-    settings = job.settings
-    work = work._replace(night=work.night.noted(*_uncommitted(settings)))
-    there = branches.waiting(settings)
-    night, state = work.night, work.state
-    moved = state != champion.read()  # a champion or a candidate
-    if settings.promotion == "branch":
-        night, state = branches.beside(night, state, there)
-        night = night.noted(*branches.told(settings, night, there))
-        night = night._replace(branch=settings.branch if night.promoted else "")
-        moved = moved and bool(night.promoted or night.candidates)
-    if moved:
-        champion.write(state)
-    tracked = _tracked(settings, promoted=moved)
-    elsewhere = [path for path in tracked if path != str(METRICS) and Path(path).exists()]
-    # of the metrics, the night's own change every night
-    anything = moved or set(changed(*elsewhere, untracked="normal")) - {str(METRICS)}
-    work = work._replace(night=night)
-    if not anything or (settings.promotion == "branch" and not moved):
-        return work
-    artifacts.write_json(METRICS, night.metrics(state))
-    outcome = f"promoted {', '.join(night.promoted)}" if night.promoted else "kept the champions"
-    message = f"nightly {night.run}: {outcome}\n\n" + "\n".join(night.reasons)
-    if settings.promotion == "branch":
-        made = branches.committed(settings, tracked, message, night, there)
-    else:
-        made = commit(tracked, message)
-    return work._replace(night=night._replace(commit=made))
-
-
-def _uncommitted(settings: Nightly) -> list[str]:
-    """That the night's result cannot be made again from its commit, where sources lie there uncommitted."""
-    paths = inputs.uncommitted(settings)
+def _tell_uncommitted(paths: Sequence[str]) -> list[str]:
+    """That the night's result cannot be made again from its commit, if sources lie there uncommitted."""
     if not paths:
         return []
     more = f" and {len(paths) - 3} more" if len(paths) > 3 else ""
     return [f"not committed: {', '.join(paths[:3])}{more}; no commit alone makes this night's result again"]
 
 
-def _tracked(settings: Nightly, *, promoted: bool) -> list[str]:
-    """What a night's commit holds."""
-    return [
-        "dvc.lock",
-        "reports/metrics",
-        "datasets/.gitignore",
-        *inputs.recorded_places(settings),
-        *(champion.paths() if promoted else []),
-    ]
+# ---- the commit, which is the promotion
 
 
-def _pushed(job: Job, work: NightWork) -> NightWork:
-    """The artifacts to the remote; where promotions wait on a branch, production as it was."""
-    settings, night = job.settings, work.night
-    if settings.remote:
-        try:
-            dvc("push", "--quiet", "--remote", settings.remote)
-        except ValueError as error:
-            night = night._replace(unpushed=True).noted(
-                f"the artifacts are not on remote {settings.remote}: {error}; the next night tries again"
-            )
-    if settings.promotion == "branch":
-        champion.as_committed()
+def _land(
+    settings: Nightly,
+    work: Work,
+    before: ChampionState,
+    snapshot: Snapshot,
+    places: Sequence[str],
+    quarantined: Mapping[str, tuple[str, str, str]],
+) -> Iterator[Work]:
+    """The night's commit, and the project brought to it; or the commit on a branch on which promotions wait.
+    A night that changed nothing but its own figures makes none."""
+    by_branch = settings.promotion == "branch"
+    tracked = ["dvc.lock", "reports/metrics", "datasets/.gitignore", *inputs.recorded_places(settings)]
+    night = work.night._replace(branch=settings.branch if by_branch and work.night.promoted else "")
+    with contextlib.chdir(COPY):
+        if work.state != before:
+            champion.write(work.state)
+            tracked += champion.paths(work.state)
+        if not by_branch or night.promoted:
+            artifacts.write_json(METRICS, night.metrics(work.state))
+    lists = inputs.read_lists(settings, COPY)
+    head = landing.check_head(snapshot, [*places, "dvc.lock", str(champion.FILE), str(champion.FOLDER)])
+    outcome = f"promoted {', '.join(night.promoted)}" if night.promoted else "kept the champions"
+    message = f"nightly {night.run}: {outcome}\n\n" + "\n".join(night.reasons)
+    tips = _find_tips(settings) if by_branch else {}
+    waiting = [tip for tip in tips.values() if git("merge-base", tip, head, check=False) != tip]
+    made = landing.commit(tracked, message, [head, *dict.fromkeys(waiting)])
+    if (
+        not made
+        or {*names("diff", "--name-only", head, made)} <= {METRICS}
+        or (by_branch and not night.promoted)
+    ):
+        landing.set_aside(quarantined, lists)
+        yield work
+        return
+    work = work._replace(night=night._replace(commit=made))
+    if by_branch:
+        branch = f"refs/heads/{settings.branch}"
+        landing.move({branch: (made, tips.get(branch, "0" * len(made)))}, message)
+        work = work.noted(
+            f"on branch {settings.branch} waits {night.run}: git merge {settings.branch} takes it over, and "
+            "the night after puts it into production"
+        )
+        yield work
+        landing.set_aside(quarantined, lists)
+        return
+    tags = {f"refs/tags/production/{loop}/{night.run}": made for loop in night.promoted}
+    landing.land(Landing(made, landing.get_branch(), head, snapshot.files, tags, quarantined, lists), message)
+    yield work
+    yield work.noted(*landing.finish())
+
+
+def _find_tips(settings: Nightly) -> dict[str, str]:
+    """{reference: commit} of the branch on which promotions wait, here and on the remotes of git: it only
+    moves forward."""
+    references = [f"refs/remotes/{remote}/{settings.branch}" for remote in git("remote").split()]
+    references.append(f"refs/heads/{settings.branch}")
+    tips = {name: git("rev-parse", "-q", "--verify", name, check=False) for name in references}
+    return {name: tip for name, tip in tips.items() if tip}
+
+
+def _push(settings: Nightly, work: Work) -> Work:
+    """The artifacts to DVC's remote, and a branch on which promotions wait to git's."""
+    night = work.night
+    try:
+        if settings.remote:
+            with contextlib.chdir(COPY):
+                dvc("push", "--quiet", "--remote", settings.remote)
+        if night.branch and (remotes := git("remote").split()):
+            git("push", "--quiet", remotes[0], f"refs/heads/{night.branch}")
+    except ValueError as error:
+        night = night._replace(unpushed=True).noted(
+            f"what was made is not on the remote: {error}; the next night tries again"
+        )
     return work._replace(night=night)
 
 
 # ---- what is remembered
 
 
-def _to_remember(job: Job, work: NightWork) -> Remembered:
-    night, last = work.night, job.last
-    known = remembered.without_secrets(job.settings)
-    if night.outcome == records.FAILED:
+def _remember(settings: Nightly | None, last: Remembered, work: Work, hashes: inputs.Hashes) -> Remembered:
+    night = work.night
+    if night.outcome == records.FAILED or settings is None:
         # a recording of a failed night is new again the next one, and must not count as two
-        return last._replace(
-            night=night.number, unpushed=night.unpushed, hashes=job.hashes.now or last.hashes, settings=known
-        )
+        return last._replace(night=night.number, hashes=hashes.now or last.hashes)
+    loops = settings.loops.items()
     return Remembered(
         night=night.number,
-        success=last.success if night.lost else _success(night.when, last.success, job.settings.watch_h),
+        success=last.success if night.lost else _success(night.when, last.success, settings.watch_h),
         # a night that lost a loop is repeated
-        inputs=None if night.lost else inputs.digest(work.digests),
+        inputs="" if night.lost else inputs.digest(work.digests),
         unpushed=night.unpushed,
         # those of a loop that is switched off are no news when it is switched on
         recordings={
             name: last.recordings.get(name, {}) if name in work.off else inputs.recordings(work.digests, loop)
-            for name, loop in job.settings.loops.items()
+            for name, loop in loops
         },
         drift=work.memory,
-        hashes=job.hashes.now,
-        settings=known,
+        hashes=hashes.now,
+        idle=night.idle,
     )
 
 
-def _success(when: str, before: str | None, watch_h: float) -> str:
+def _success(when: str, before: str, watch_h: float) -> str:
     """The time of the last success. A clock that was set back does not make it older, unless the one before
     lies so far ahead that the watchdog would wait for it: one of the two clocks was wrong."""
     if before and watch.hours_since(before, datetime.datetime.fromisoformat(when)) < -watch_h:
         return when
-    return max(when, before or "")
-
-
-# ---- the way back
-
-
-def rollback(run: str, loop: str) -> str:
-    """Puts the champion of an earlier run back into production, bit by bit, and says what was done."""
-    params.load(Nightly, "nightly")
-    with guarding.alone():
-        check_attached()
-        state = champion.read()
-        earlier = champion.earlier(state, run, loop)
-        when = watch.stamp(datetime.datetime.now(datetime.UTC))
-        for name, former in earlier.items():
-            champion.put_back(name, former)
-            again = former._replace(why=f"rolled back to {former.run} by hand", since=when)
-            state = champion.in_production(state, name, again, event=ROLLED_BACK, when=when, why="by hand")
-        champion.write(state)
-        names = ", ".join(f"{name} is {former.run}" for name, former in earlier.items())
-        made = commit(champion.paths(), f"rollback: {names}")
-        return f"rollback: {names} again, every file as it was; commit {made[:12]}"
+    return max(when, before)

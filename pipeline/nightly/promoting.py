@@ -21,7 +21,7 @@ from pipeline.nightly.records import (
     Night,
     candidate_of,
 )
-from pipeline.nightly.reproducing import wiring
+from pipeline.nightly.reproducing import read_stages
 from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.store import artifacts
 from pipeline.verdict.verdict import PASSED, Verdict
@@ -41,7 +41,7 @@ class JudgedLoop(NamedTuple):
     metrics: ChampionMetrics | None = None
 
 
-def judged(
+def judge_all(
     settings: Nightly, night: Night, state: ChampionState, *, lineage: Callable[[], Lineage]
 ) -> tuple[Night, ChampionState]:
     """The night with a decision on each loop; what is in production, and the candidates beside it. Their
@@ -53,21 +53,22 @@ def judged(
     for name in settings.loops:
         verdict = by_loop.get(name)
         try:
-            decision, metrics = decided(settings, name, night, state, verdict)
+            decision, metrics = judge_loop(settings, name, night, state, verdict)
         except reporting.REFUSALS as error:  # what cannot be judged stops no other loop
-            why = reporting.told(error, night.run)
+            why = " ".join(str(error).split())
             decision = LoopDecision(records.FAILED, [f"it cannot be judged, and its champion stays: {why}"])
             metrics = None
-        decisions[name] = decision = decision._replace(verdict=verdict)
+        decision = decision._replace(verdict=verdict and verdict._replace(rules=()))
+        decisions[name] = decision
         if decision.promotes or decision.decision == CANDIDATE:
-            state = _placed(settings, name, night, state, JudgedLoop(decision, metrics), made_from)
+            state = _place(settings, name, night, state, JudgedLoop(decision, metrics), made_from)
         if (
             name in state.candidates
             and decision.decision != CANDIDATE
             and verdict
             and verdict.state == PASSED
         ):
-            state = _without_candidate(state, name)
+            state = _drop_candidate(state, name)
     if all(decision.decision == records.FAILED for decision in decisions.values()):
         whys = (f"{name}: {decision.reasons[0]}" for name, decision in decisions.items())
         raise ValueError("; ".join(whys))
@@ -81,30 +82,31 @@ def judged(
 # ---- one loop
 
 
-def decided(
+def judge_loop(
     settings: Nightly, name: str, night: Night, state: ChampionState, verdict: Verdict | None
 ) -> JudgedLoop:
     """What becomes of the challenger of one loop, with what it measured; `verdict` is None where the loop has
     no page."""
     loop, present = settings.loops[name], state.champions.get(name)
-    files, contestant = there(loop), verdict.subject if verdict else _declared(settings, name)
+    files = list_files(loop)
+    contestant = verdict.subject if verdict else _declared(settings, name)
     if lacking := champion.missing([path for path in loop.artifacts if path not in OPTIONAL]):
-        return _kept(f"the challenger lacks {lacking[0]}; its stage did not write it")
+        return _keep(f"the challenger lacks {lacking[0]}; its stage did not write it")
     passes = verdict is None or verdict.state == PASSED
-    same = present is not None and champion.same(present.installed.files, files)
+    same = present is not None and champion.same(present.files, files)
     if same and (not passes or runs(settings, name, present, contestant) == contestant):
         does_not = "" if passes else f", which does not pass: {verdict.sentence}"
-        return _kept(f"the challenger is the champion, byte for byte{does_not}")
-    if run := champion.rolled_back(state, name, files):
-        return _kept(f"the challenger is that of {run}, which was rolled back by hand")
+        return _keep(f"the challenger is the champion, byte for byte{does_not}")
+    if run := champion.find_rolled_back(state, name, files):
+        return _keep(f"the challenger is that of {run}, which was rolled back by hand")
     judging = judge.judge(loop, settings)
     if not passes:
         return _candidate(judging, verdict, state.candidates.get(name), files, verdict.sentence)
-    if verdict and (why := uncertified(loop, contestant)):
+    if verdict and (why := find_missing_certificate(loop, contestant)):
         return _candidate(judging, verdict, state.candidates.get(name), files, why)
     own = f"datasets/{judge.DESIGNED_FROM[contestant]}" if contestant in judge.DESIGNED_FROM else ""
     if own and own not in loop.artifacts:
-        return _kept(
+        return _keep(
             f"{contestant} is designed from {own}, which the champion would lack; add it to "
             f"nightly.loops.{name}.artifacts"
         )
@@ -114,7 +116,7 @@ def decided(
         if present:
             before = judging.measure(champion.FOLDER / name, runs(settings, name, present, contestant))
     except judge.NotComparable as reason:
-        return _kept(f"champion and challenger cannot be compared: {reason}")
+        return _keep(f"champion and challenger cannot be compared: {reason}")
     decision = decide(
         before,
         challenger,
@@ -126,14 +128,14 @@ def decided(
     return JudgedLoop(decision, _metrics(challenger))
 
 
-def there(loop: NightlyLoop) -> list[str]:
+def list_files(loop: NightlyLoop) -> list[str]:
     """The artifacts of a loop without the optional ones that its record did not determine."""
     return [path for path in loop.artifacts if path not in OPTIONAL or Path(path).is_file()]
 
 
 def runs(settings: Nightly, loop: str, present: Champion, contestant: str) -> str:
-    """The contestant that a champion runs as. One of an earlier version did not say: of the temperature loop
-    it is what nightly.holdout.controller said, of the others whatever the challenger is."""
+    """The contestant that a champion runs as. A loop without a page has none: it is the declared one, or
+    the challenger's."""
     return present.contestant or _declared(settings, loop) or contestant
 
 
@@ -141,7 +143,7 @@ def _declared(settings: Nightly, loop: str) -> str:
     return judge.declared(settings.holdout) if settings.loops[loop].judge == "temperature" else ""
 
 
-def _kept(reason: str) -> JudgedLoop:
+def _keep(reason: str) -> JudgedLoop:
     return JudgedLoop(LoopDecision(KEPT, [reason]))
 
 
@@ -151,7 +153,7 @@ def _metrics(evidence: judge.CaseCosts) -> ChampionMetrics:
     return ChampionMetrics(evidence.panel, mean_cost if np.isfinite(mean_cost) else None, guards)
 
 
-def uncertified(loop: NightlyLoop, contestant: str) -> str:
+def find_missing_certificate(loop: NightlyLoop, contestant: str) -> str:
     """Why a challenger of the temperature loop that passes the page's rules has no certificate; empty where
     it has one, and where the project has no stage that certifies."""
     if not _asks_for_one(loop):
@@ -168,7 +170,7 @@ def uncertified(loop: NightlyLoop, contestant: str) -> str:
     return ""
 
 
-def certified(loop: NightlyLoop) -> list[str]:
+def list_certified(loop: NightlyLoop) -> list[str]:
     """The files of a certified controller that are there, for the champion's folder."""
     return [path for path in CERTIFIED if _asks_for_one(loop) and Path(path).is_file()]
 
@@ -176,8 +178,7 @@ def certified(loop: NightlyLoop) -> list[str]:
 def _asks_for_one(loop: NightlyLoop) -> bool:
     """Whether a loop's champion needs a certificate: that of the temperature loop, where the project has the
     stage that certifies."""
-    wired = loop.judge == "temperature" and Path("dvc.yaml").is_file()
-    return wired and CERTIFYING in wiring({}).upstream
+    return loop.judge == "temperature" and CERTIFYING in read_stages("dvc.yaml")
 
 
 def _candidate(
@@ -186,7 +187,7 @@ def _candidate(
     """A challenger that the page's rules or its certificate keep out of production, and `why`, with what it
     measures all the same."""
     decision = LoopDecision(CANDIDATE, [why])
-    if before and before.contestant == verdict.subject and champion.same(before.installed.files, files):
+    if before and before.contestant == verdict.subject and champion.same(before.files, files):
         return JudgedLoop(decision, before.metrics)
     try:
         evidence = judging.measure(Path("datasets"), verdict.subject)
@@ -199,31 +200,32 @@ def _candidate(
 # ---- what lies in champion/
 
 
-def _placed(
+def _place(
     settings: Nightly, name: str, night: Night, state: ChampionState, judged: JudgedLoop, lineage: Lineage
 ) -> ChampionState:
     """The state with a challenger in production or as the candidate; its files lie in that folder then."""
     decision, metrics = judged
-    files, verdict, waits = there(settings.loops[name]), decision.verdict, not decision.promotes
+    files, verdict, waits = list_files(settings.loops[name]), decision.verdict, not decision.promotes
     before = state.candidates.get(name) if waits else None
-    if before and champion.same(before.installed.files, files):
-        installed, run, when, lineage = before.installed, before.run, before.when, before.lineage
+    if before and champion.same(before.files, files):
+        folder, md5s, run, when = before.folder, before.files, before.run, before.when
+        lineage = before.lineage
     else:
         reference = None if waits else screening.reference(settings.loops[name], Path("datasets"))
         beside = {screening.REFERENCE: reference} if reference else {}
-        installed = champion.install(
-            candidate_of(name) if waits else name, [*files, *certified(settings.loops[name])], beside
+        folder, md5s = champion.install(
+            candidate_of(name) if waits else name, [*files, *list_certified(settings.loops[name])], beside
         )
         run, when = night.run, night.when
-    one = Champion(run, when, "; ".join(decision.reasons), installed, metrics, lineage)
+    one = Champion(run, when, "; ".join(decision.reasons), folder, md5s, metrics, lineage)
     if verdict:
         one = one._replace(contestant=verdict.subject, rehearsal=verdict.rehearsal, verdict=verdict.sentence)
     if waits:
         return state._replace(candidates={**state.candidates, name: one})
-    return champion.in_production(state, name, one, event=decision.decision)
+    return champion.promote(state, name, one, event=decision.decision)
 
 
-def _without_candidate(state: ChampionState, name: str) -> ChampionState:
+def _drop_candidate(state: ChampionState, name: str) -> ChampionState:
     """The state after a challenger has passed: what did not pass before it is of no more use."""
-    champion.removed(candidate_of(name))
+    champion.remove(candidate_of(name))
     return state._replace(candidates={loop: one for loop, one in state.candidates.items() if loop != name})

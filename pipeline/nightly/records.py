@@ -5,12 +5,37 @@
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
+import pydantic
+
+from pipeline.statistics import Paired
 from pipeline.verdict.verdict import Verdict
 
-if TYPE_CHECKING:  # it imports scipy, and a night with nothing new is done without
-    from pipeline.statistics import Paired
+R = TypeVar("R")
+
+
+def to_json(value: Any) -> Any:
+    """A record as JSON: its fields by name, tuples as lists. JSON knows no infinity: it is null."""
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        return {name: to_json(field) for name, field in value._asdict().items()}
+    if isinstance(value, Mapping):
+        return {name: to_json(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_json(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def from_json(record: type[R], fields: Any) -> R:
+    """What `to_json` gave of a record; fields that are missing are as declared. Raises ValueError if one is
+    missing that has no value otherwise, or is of another kind."""
+    try:
+        return pydantic.TypeAdapter(record).validate_python(fields)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the whole"
+        raise ValueError(f"expected a {record.__name__}, found {place} of another form") from None
+
 
 # ---- drift
 
@@ -33,26 +58,6 @@ class Alarm(NamedTuple):
     consequences: tuple[str, ...] = ()
     kind: str = ""
     channel: str = ""
-
-    @classmethod
-    def read(cls, entry: Mapping[str, Any]) -> "Alarm":
-        """An alarm as `to_json` gave it. If somebody edited the file, a missing field is empty."""
-        return cls(
-            str(entry.get("loop", "")),
-            str(entry.get("key", "")),
-            str(entry.get("recording", "")),
-            str(entry.get("cause", "")),
-            entry.get("sigmas", 0.0),
-            tuple(entry.get("consequences", ())),
-            str(entry.get("kind", "")),
-            str(entry.get("channel", "")),
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        fields = {
-            key: value for key, value in self._asdict().items() if value or key not in ("kind", "channel")
-        }
-        return fields | {"consequences": list(self.consequences)}
 
 
 class ParameterChange(NamedTuple):
@@ -83,30 +88,13 @@ class ClosedLoopChange(NamedTuple):
 class RecordingFigures(NamedTuple):
     """What the champion's observer measured on one recording, against the champion's own: by parameter of the
     plant, by output, and by figure of the closed loop. `not_applicable` is why the closed loop was not asked,
-    empty where it was."""
+    empty where it was. `least` says the smallest changes that the recording could have shown."""
 
     parameters: Mapping[str, ParameterChange]
     innovation: Mapping[str, InnovationChange] = {}
     closed_loop: Mapping[str, ClosedLoopChange] = {}
     not_applicable: str = ""
-
-    @classmethod
-    def read(cls, fields: Mapping[str, Any]) -> "RecordingFigures":
-        loop = fields.get("closed_loop") or {}
-        return cls(
-            {name: ParameterChange(**change) for name, change in (fields.get("parameters") or {}).items()},
-            {name: InnovationChange(**change) for name, change in (fields.get("innovation") or {}).items()},
-            {name: ClosedLoopChange(**moved) for name, moved in loop.items() if isinstance(moved, dict)},
-            loop.get("not_applicable") or "",
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        loop: dict[str, Any] = {name: moved._asdict() for name, moved in self.closed_loop.items()}
-        return {
-            "parameters": {name: change._asdict() for name, change in self.parameters.items()},
-            "innovation": {name: change._asdict() for name, change in self.innovation.items()},
-            "closed_loop": {"not_applicable": self.not_applicable} if self.not_applicable else loop,
-        }
+    least: str = ""
 
 
 class LoopDrift(NamedTuple):
@@ -155,27 +143,17 @@ class NightDrift(NamedTuple):
     def notes(self) -> list[str]:
         return [note for drift in self.loops.values() for note in drift.notes]
 
-    def to_json(self) -> dict[str, Any]:
-        """As reports/metrics/nightly.json and .beadline/nights.json have it."""
-        return {
-            "alarms": [alarm.to_json() for alarm in self.alarms],
-            "watched": [alarm.to_json() for alarm in self.watched],
-            "figures": {path: figures.to_json() for path, figures in self.figures.items()},
-            "notes": self.notes,
-        }
+    def metrics(self) -> dict[str, Any]:
+        """As reports/metrics/nightly.json has it."""
+        return to_json({"alarms": self.alarms, "watched": self.watched, "figures": self.figures})
 
-    @classmethod
-    def read(cls, drift: Mapping[str, Any] | None) -> "NightDrift":
-        """The record that `to_json` gave; empty if a night measured none."""
-        night, drift = cls({}), drift or {}
-        for key in ("alarms", "watched"):
-            for alarm in map(Alarm.read, drift.get(key) or []):
-                loop = night.loops.setdefault(alarm.loop, LoopDrift.none(alarm.loop))
-                getattr(loop, key).append(alarm)
-        for path, figures in (drift.get("figures") or {}).items():
-            plant = night.loops.setdefault(PLANT, LoopDrift.none(PLANT))
-            plant.figures[path] = RecordingFigures.read(figures)
-        return night
+
+class RecordShare(NamedTuple):
+    """The shares of a new recording in percent of its samples: used in learning; masked by `ingest`; cut."""
+
+    used_percent: float
+    masked_percent: float
+    cut_percent: float
 
 
 # ---- production: champion.json
@@ -198,27 +176,10 @@ class Lineage(NamedTuple):
     params: Mapping[str, str] = {}
     recordings: Mapping[str, Mapping[str, str]] = {}
 
-    @classmethod
-    def read(cls, fields: Mapping[str, Any]) -> "Lineage":
-        lineage = cls(**{name: fields[name] for name in cls._fields if name in fields})
-        return lineage._replace(uncommitted=tuple(lineage.uncommitted))
-
-    def to_json(self) -> dict[str, Any]:
-        return self._asdict() | {"uncommitted": list(self.uncommitted)}
-
-
-class Installed(NamedTuple):
-    """The files of champion/<loop>: what DVC's pointer says of the folder, MD5 by path, and of the outs of
-    dvc.lock that they were copied from."""
-
-    folder: Mapping[str, Any]
-    files: Mapping[str, str] = {}
-    outs: Mapping[str, str] = {}
-
 
 class ChampionMetrics(NamedTuple):
     """What the judge measured of a champion when it was promoted: the panel's name, mean cost of its cases
-    (None where one of them fails), and {guard: figure}."""
+    (None if one of them fails), and {guard: figure}."""
 
     panel: str
     mean_cost: float | None
@@ -226,18 +187,18 @@ class ChampionMetrics(NamedTuple):
 
 
 class Champion(NamedTuple):
-    """One loop's champion: the night that promoted it, when and why, its files, figures and lineage. `since`
-    is the time of a rollback to it, empty where there was none.
+    """One loop's champion, or a candidate: the night that made it, when and why; what DVC's pointer says of
+    its folder, and MD5 of its files by path; figures and lineage. `since` is the time of a rollback to it.
 
-    `contestant` is the controller that runs, by its name on the pages; of earlier versions it is empty.
-    `rehearsal`: it was judged on simulated data alone. `verdict` is what the page said of it then. A
-    candidate is written alike: a challenger that the page's rules kept out of production.
+    `contestant` is the controller that runs, by its name on the pages. `rehearsal`: it was judged on
+    simulated data alone. `verdict` is what the page said of it then.
     """
 
     run: str
     when: str
-    why: str
-    installed: Installed
+    why: str = ""
+    folder: Mapping[str, Any] = {}
+    files: Mapping[str, str] = {}
     metrics: ChampionMetrics | None = None
     lineage: Lineage = Lineage()
     since: str = ""
@@ -248,42 +209,13 @@ class Champion(NamedTuple):
     @property
     def md5(self) -> str:
         """DVC's hash of the whole folder."""
-        return self.installed.folder["md5"]
-
-    @classmethod
-    def read(cls, fields: Mapping[str, Any]) -> "Champion":
-        metrics = fields.get("metrics")
-        return cls(
-            fields["run"],
-            fields["when"],
-            fields.get("why", ""),
-            Installed(fields["folder"], fields.get("files", {}), fields.get("outs", {})),
-            ChampionMetrics(metrics["panel"], metrics["mean_cost"], metrics["guards"]) if metrics else None,
-            Lineage.read(fields.get("lineage", {})),
-            fields.get("since", ""),
-            fields.get("contestant", ""),
-            fields.get("rehearsal", False),
-            fields.get("verdict", ""),
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        return {
-            "run": self.run,
-            "when": self.when,
-            "why": self.why,
-            **self.installed._asdict(),
-            "metrics": self.metrics._asdict() if self.metrics else {},
-            "lineage": self.lineage.to_json(),
-        } | self._nonempty("since", "contestant", "rehearsal", "verdict")
-
-    def _nonempty(self, *names: str) -> dict[str, Any]:
-        return {name: value for name in names if (value := getattr(self, name))}
+        return self.folder["md5"]
 
 
 class HistoryLine(NamedTuple):
     """One change of production: which loop, what happened, when and why, and the champion from then on.
-    `before` is the run of the champion until then, None where there was none. `replaced` are the files of
-    the champion that a rollback took out, MD5 by path."""
+    `before` is the run of the champion until then, None if there was none. `replaced` are the files of the
+    champion that a rollback took out, MD5 by path."""
 
     run: str
     loop: str
@@ -292,18 +224,7 @@ class HistoryLine(NamedTuple):
     why: str
     before: str | None
     champion: Champion
-    replaced: Mapping[str, str] | None = None
-
-    @classmethod
-    def read(cls, fields: Mapping[str, Any]) -> "HistoryLine":
-        plain = (fields[name] for name in ("run", "loop", "event", "when", "why", "before"))
-        return cls(*plain, Champion.read(fields["champion"]), fields.get("replaced"))
-
-    def to_json(self) -> dict[str, Any]:
-        fields = self._asdict() | {"champion": self.champion.to_json()}
-        if self.replaced is None:
-            del fields["replaced"]
-        return fields
+    replaced: Mapping[str, str] = {}
 
 
 class ChampionState(NamedTuple):
@@ -318,34 +239,8 @@ class ChampionState(NamedTuple):
     @property
     def folders(self) -> dict[str, Champion]:
         """What lies below champion/, by folder."""
-        return {
-            **self.champions,
-            **{candidate_of(loop): candidate for loop, candidate in self.candidates.items()},
-        }
-
-    @classmethod
-    def read(cls, fields: Mapping[str, Any]) -> "ChampionState":
-        """Raises ValueError where the file lacks a field that production cannot be known without."""
-        try:
-            champions = {loop: Champion.read(entry) for loop, entry in fields["champions"].items()}
-            candidates = {
-                loop: Champion.read(entry) for loop, entry in (fields.get("candidates") or {}).items()
-            }
-            return cls(champions, tuple(map(HistoryLine.read, fields["history"])), candidates)
-        except (KeyError, TypeError, AttributeError) as error:
-            raise ValueError(
-                "champion.json: expected champions and history, each with run, when and folder, "
-                f"found no {error}; take the file of the last good commit (git log champion.json)"
-            ) from None
-
-    def to_json(self) -> dict[str, Any]:
-        candidates = {loop: candidate.to_json() for loop, candidate in self.candidates.items()}
-        return {
-            "schema": "champion",
-            "version": 1,
-            "champions": {loop: champion.to_json() for loop, champion in self.champions.items()},
-            "history": [line.to_json() for line in self.history],
-        } | ({"candidates": candidates} if candidates else {})
+        waiting = {candidate_of(loop): candidate for loop, candidate in self.candidates.items()}
+        return {**self.champions, **waiting}
 
 
 # ---- decisions
@@ -367,75 +262,27 @@ class Guard(NamedTuple):
 
 class LoopDecision(NamedTuple):
     """What was decided of one loop's challenger, and why: promoted, kept, first champion or candidate.
-    `paired` is the test of challenger against champion, None where they were not compared. `guards` go by
-    name, None where nothing was judged. `verdict` is the page's on this loop, None where it has no page."""
+    `paired` is the test of challenger against champion, None if they were not compared. `verdict` is the
+    page's on this loop without its rules, None if it has no page."""
 
     decision: str
     reasons: list[str]
-    paired: "Paired | None" = None
-    guards: Mapping[str, Guard] | None = None
+    paired: Paired | None = None
+    guards: Mapping[str, Guard] = {}
     verdict: Verdict | None = None
 
     @property
     def promotes(self) -> bool:
         return self.decision in (PROMOTED, FIRST)
 
-    @classmethod
-    def read(cls, fields: Mapping[str, Any]) -> "LoopDecision":
-        guards = {
-            name: Guard(*(figures.get(key) for key in Guard._fields))
-            for name, figures in fields.get("guards", {}).items()
-        }
-        page = fields.get("verdict")
-        verdict = Verdict.read(page.get("loop", ""), page) if page else None
-        return cls(fields["decision"], fields["reasons"], _paired(fields.get("paired")), guards, verdict)
-
-    def to_json(self) -> dict[str, Any]:
-        fields: dict[str, Any] = {"decision": self.decision, "reasons": self.reasons}
-        if self.paired:
-            fields["paired"] = self.paired._asdict()
-        if self.guards is not None:
-            # a first champion has a challenger's figure alone
-            keys = Guard._fields if self.paired else ("challenger",)
-            fields["guards"] = {
-                name: {key: _finite(getattr(guard, key)) for key in keys}
-                for name, guard in self.guards.items()
-            }
-        if self.verdict:
-            fields["verdict"] = {"loop": self.verdict.loop, **self.verdict.metrics()}
-        return fields
-
-
-def _finite(figure: float | None) -> float | None:
-    """JSON knows no infinity."""
-    return figure if figure is not None and math.isfinite(figure) else None
-
-
-def _placed(champion: Champion) -> dict[str, Any]:
-    """A champion or a candidate as the night's metrics have it."""
-    names = ("run", "when", "why", "contestant", "rehearsal")
-    return {name: getattr(champion, name) for name in names}
-
-
-def _paired(test: Mapping[str, Any] | None) -> "Paired | None":
-    if not test:
-        return None
-    from pipeline.statistics import Paired
-
-    return Paired(*(test[name] for name in Paired._fields))
-
-
-# ---- the night
-
 
 class Night(NamedTuple):
-    """One night, as .beadline/nights.json and reports/metrics/nightly.json have it.
+    """One night: its number, name and time; how it ended and why, and what else is to be said.
 
-    Its number, name and time; how it ended, and why. What was new by loop, and whether that was held against
-    the champions (`screened`). The drift of every loop, and the reason of each recording that was set aside.
-    What was decided of each loop, and which were promoted. The commit, whether its artifacts have yet to
-    reach the remote, and how long it took in s (None while it runs). The branch that its promotions wait on,
-    empty where they are in production.
+    New recordings by loop, and how much of them was used; drift; the reason of each recording that was set
+    aside. What was decided of each loop, and which were promoted. The commit, whether its artifacts have yet
+    to reach the remote, and how long the night took in s. The branch that its promotions wait on, empty if
+    they are in production. `idle`: nights in a row without a new recording, this one among them.
     """
 
     number: int
@@ -445,15 +292,16 @@ class Night(NamedTuple):
     reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     new_recordings: Mapping[str, list[str]] = {}
-    screened: bool = False
+    used: Mapping[str, RecordShare] = {}
     drift: NightDrift = NightDrift({})
     quarantined: Mapping[str, str] = {}
     decisions: Mapping[str, LoopDecision] = {}
     promoted: tuple[str, ...] = ()
     commit: str = ""
     unpushed: bool = False
-    seconds: float | None = None
+    seconds: float = 0.0
     branch: str = ""
+    idle: int = 0
 
     @property
     def lost(self) -> list[str]:
@@ -475,75 +323,54 @@ class Night(NamedTuple):
     def ended(self, outcome: str, *reasons: str) -> "Night":
         return self._replace(outcome=outcome, reasons=reasons)
 
-    def without_measurement(self) -> "Night":
-        """The night before its recordings were looked at; what was set aside stays set aside."""
-        notes = tuple(note for note in self.notes if note not in self.drift.notes)
-        return self._replace(new_recordings={}, screened=False, drift=NightDrift({}), notes=notes)
-
-    @classmethod
-    def read(cls, fields: Mapping[str, Any]) -> "Night":
-        decisions = {name: LoopDecision.read(entry) for name, entry in fields.get("decisions", {}).items()}
-        return cls(
-            number=fields["night"],
-            run=fields["run"],
-            when=fields["when"],
-            outcome=fields["outcome"],
-            reasons=tuple(fields.get("reasons", ())),
-            notes=tuple(fields.get("notes", ())),
-            new_recordings=fields.get("new_recordings", {}),
-            screened="drift" in fields,
-            drift=NightDrift.read(fields.get("drift")),
-            quarantined=fields.get("quarantined", {}),
-            decisions=decisions,
-            promoted=tuple(fields.get("promoted", ())),
-            commit=fields.get("commit", ""),
-            unpushed=fields.get("unpushed", False),
-            seconds=fields.get("seconds"),
-            branch=fields.get("branch", ""),
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """As .beadline/nights.json has it: what the night did not come to is not there."""
-        fields = {"night": self.number, "run": self.run, "when": self.when, "outcome": self.outcome}
-        fields["notes"] = list(self.notes)
-        if self.screened or self.new_recordings:
-            fields["new_recordings"] = dict(self.new_recordings)
-        if self.screened:
-            fields["drift"] = self.drift.to_json()
-        if self.screened or self.quarantined:
-            fields["quarantined"] = dict(self.quarantined)
-        if self.decisions:
-            fields["decisions"] = self._decisions()
-            fields["promoted"] = list(self.promoted)
-        fields["reasons"] = list(self.reasons)
-        later = {"commit": self.commit, "unpushed": self.unpushed, "branch": self.branch}
-        fields |= {name: value for name, value in later.items() if value}
-        return fields | ({} if self.seconds is None else {"seconds": self.seconds})
-
     def metrics(self, state: ChampionState) -> dict[str, Any]:
         """As reports/metrics/nightly.json has it, with what is in production."""
         production, candidates = (
-            {name: _placed(champion) for name, champion in champions.items()}
+            {
+                name: {key: getattr(one, key) for key in ("run", "when", "why", "contestant", "rehearsal")}
+                for name, one in champions.items()
+            }
             for champions in (state.champions, state.candidates)
         )
-        return {
-            "decision": self.outcome,
-            "reasons": list(self.reasons),
-            "decisions": self._decisions(),
-            "drift": self.drift_row(),
-            "champion": production,
-            "candidates": candidates,
-            "night": self.number,
-            "run": self.run,
-            "when": self.when,
-            "seconds": self.seconds,
-            "notes": list(self.notes),
-            "new_recordings": dict(self.new_recordings),
-            "quarantined": dict(self.quarantined),
-        }
+        fields = to_json(self._replace(drift=NightDrift({})))
+        named = {"decision": self.outcome, "night": self.number, "drift": self.drift.metrics()}
+        return fields | named | {"champion": production, "candidates": candidates}
 
-    def drift_row(self) -> dict[str, Any]:
-        return self.drift.to_json() if self.screened else {}
 
-    def _decisions(self) -> dict[str, Any]:
-        return {name: decision.to_json() for name, decision in self.decisions.items()}
+# ---- memory
+
+
+class DriftMemory(NamedTuple):
+    """Of the last night with recordings: keys of what was watched or raised an alarm, and its alarms.
+    `drifted` are the recordings of each loop since its alarm; `night` is 0 before the first. `recent` is what
+    the last nights named of each loop: {loop: {"reference": digest of what they were held against, "nights":
+    [{change: [size, standard deviation]}]}}, over which a change is pooled; "seeming" is the same of
+    what nights left unnamed."""
+
+    pending: tuple[str, ...] = ()
+    alarms: tuple[Alarm, ...] = ()
+    drifted: Mapping[str, list[str]] = {}
+    night: int = 0
+    recent: Mapping[str, Mapping[str, Any]] = {}
+
+    @classmethod
+    def read(cls, fields: Mapping[str, Any]) -> "DriftMemory":
+        return from_json(cls, fields)
+
+    def to_json(self) -> dict[str, Any]:
+        return to_json(self)
+
+
+class Remembered(NamedTuple):
+    """The last night: its number, time of the last success (empty before the first), and the digest of all
+    that it was made from. `unpushed`: its artifacts have yet to reach the remote. `recordings` is {loop:
+    {path: digest}}; `hashes` is {path: [size, time of change, inode, digest]}; `idle` as of a night."""
+
+    night: int = 0
+    success: str = ""
+    inputs: str = ""
+    unpushed: bool = False
+    recordings: Mapping[str, Mapping[str, str]] = {}
+    drift: DriftMemory = DriftMemory()
+    hashes: Mapping[str, list[int | str]] = {}
+    idle: int = 0

@@ -24,6 +24,7 @@ SPACINGS = (1, 4, 16)  # samples from one that is asked to the next
 GONE = 30  # samples without a number that an honest log may have, all together
 ON = 0.01  # share of a heater's range that is given by one that is on
 LASTS = 60  # samples for which a sensor stays in doubt: one that only seems to stand still soon moves again
+SHARE = 1 / 3  # of a record, if it is not in doubt to the end: a good loop holds a coarse sensor still
 
 
 class SensorFault(NamedTuple):
@@ -90,6 +91,7 @@ def _follow(
 ) -> Iterator[SensorFault]:
     """Every sensor in doubt, once."""
     silent, told, begin = np.zeros(len(s.d), int), set(), 0
+    last = sum(len(y) for _, y in segments) - 1
     heaters = s.input_of[[int((s.of_input == i).argmax()) for i in range(len(s.d))]]
     for u, y in segments:
         k, doubtful = supervise.kept(s), np.zeros((len(KINDS), len(s.d)), int)
@@ -108,7 +110,9 @@ def _follow(
                 unfounded[1:] |= (there & (doubtful == 0))[1:] & off
             unfounded &= there
             doubtful = np.where(there & ~unfounded, doubtful + spacing, 0)
-            certain = np.vstack([there[:1] & (silent >= GONE), doubtful[1:] >= LASTS])
+            ends = begin + t + spacing > last
+            enough = LASTS if ends else max(LASTS, SHARE * last)
+            certain = np.vstack([there[:1] & (silent >= GONE), doubtful[1:] >= enough])
             for which, i in np.argwhere(certain):
                 if i not in told:
                     told.add(i)

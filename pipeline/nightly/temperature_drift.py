@@ -1,6 +1,7 @@
 """The temperature loop's part of a night: new recordings held against those of the champion. A record that is
 not what it says is set aside, and what it says of the machine, put right, counts all the same."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,9 +23,10 @@ from pipeline.nightly.records import (
     RecordingFigures,
 )
 from pipeline.nightly.settings import DriftLimits, NightlyLoop
-from pipeline.recordings.recording_folders import RecordingTable
 from pipeline.store import artifacts, params
-from pipeline.temperature.settings import Plant, recorded
+from pipeline.temperature.identification import model_choice
+from pipeline.temperature.settings import Plant, PlantSignal, recorded
+from pipeline.temperature.tables import set_point_of
 
 REFERENCE = "reference.json"  # in the champion's folder
 PIECES = 4  # into which a single record of the champion is cut, to stand for nights
@@ -41,6 +43,13 @@ NIGHTS_FLOORS, PIECES_FLOORS = baseline.Floors(0.03, 0.25), baseline.Floors(0.2,
 # mean offset of the champion's own nights, in units of drift.offset_degC, up to which they count as a
 # closed loop at the references
 SETTLED = 5.0
+FOLDS = 4  # models that are identified without some of the champion's nights
+# no machine changes by more within a night: then the record is in doubt
+MOST_GAIN_PERCENT, MOST_OFFSET_DEGC = 80.0, 50.0
+ROOM_DEGC, COLDEST_DEGC, HOTTEST_DEGC = 20.0, -30.0, 60.0  # of the champion's nights; of any room
+UNEXPLAINED = 3.0  # by so much more than an honest record may leave, a record leaves what no cause explains
+LIKELY, WORTH_NAMING = 4.0, 1.5  # times that a record fits better with a mistake undone
+SHORTEST = 60  # samples of a stretch at one set-point that can settle
 PARTS = 4  # of a record, whose scatter tells how well its closed-loop figures are known
 
 
@@ -97,9 +106,11 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
     """champion/<loop>/reference.json of the model below `folder`, from the loop's recordings, or `only` those
     named; None where they are none, or too short."""
     machine = recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet")
-    records = judge.record_segments(Path(loop.recordings), machine, broken={})
+    records = judge.read_records(Path(loop.recordings), machine, {})
     named = [path.removeprefix(f"{loop.recordings}/") for path in only] or sorted(records)
-    nights = [_last(records[path]) for path in named if records.get(path)][-NIGHTS:]
+    kept = [records[path].record for path in named if path in records]
+    kept = [one for one in kept if judge.segments(one, machine)][-NIGHTS:]
+    nights = [_last(judge.segments(one, machine)) for one in kept]
     floors = NIGHTS_FLOORS if len(nights) > 1 else PIECES_FLOORS
     if len(nights) == 1:
         nights = [
@@ -107,8 +118,11 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
             for u, y in nights[0]
             for part, other in zip(np.array_split(u, PIECES), np.array_split(y, PIECES), strict=True)
         ]
+        kept = _cut(kept[0])
     try:
-        own = baseline.measured(ProductionModel(judge.identified(folder), _samples(nights)), nights, floors)
+        production = ProductionModel(judge.identified(folder), _samples(nights))
+        # of recordings that are named, the champion's model is not made
+        own = baseline.measured(production, nights, floors, None if only else _without_each(machine, nights))
     except ValueError:
         return None
     return {
@@ -116,9 +130,33 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
         "version": baseline.VERSION,
         "samples": _samples(nights),
         "own": own.to_json(),
-        "loop": [_closed_loop(night, machine) for night in nights],
+        "loop": [_closed_loop(one, machine) for one in kept],
         "steps": sensors.steps(nights).tolist(),
     }
+
+
+def _cut(record: Mapping[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
+    """The record's last LONGEST samples in PIECES."""
+    parts = {name: np.array_split(column[-LONGEST:], PIECES) for name, column in record.items()}
+    return [{name: columns[k] for name, columns in parts.items()} for k in range(PIECES)]
+
+
+def _without_each(machine: Plant, nights: Sequence[Segments]) -> list[ProductionModel]:
+    """For each night a model that was identified without it, as a new night's is: what such a model gets
+    wrong of it is no change of the machine. Nights share FOLDS models. Raises ValueError where the others do
+    not determine one."""
+    own = params.read()["identify_plant"]
+    settings = model_choice.Settings(offset=own["offset"], max_order=own["max_order"])
+    names, folds = [signal.name for signal in machine.inputs], min(FOLDS, len(nights))
+    models = []
+    for fold in range(folds):
+        others = [pair for k, night in enumerate(nights) if k % folds != fold for pair in night]
+        u, y = [pair[0] for pair in others], [pair[1] for pair in others]
+        found = model_choice.identify(
+            u, y, sample_time_s=machine.sample_time_s, settings=settings, names=names
+        )
+        models.append(ProductionModel(found.plant, _samples(nights)))
+    return [models[k % folds] for k in range(len(nights))]
 
 
 def _read_reference(folder: Path) -> ProductionReference | None:
@@ -198,11 +236,10 @@ def look(
         if _stand_still(drifted, path, result.record, held, machine):
             continue
         segments = _last(judge.segments(result.record, machine))
-        drifted.notes.append(_used(path, result, segments))
         if not segments:
             continue
         try:
-            drifted = _one(limits, drifted, path, segments, held, machine, nights, pending)
+            drifted = _one(limits, drifted, path, result.record, held, machine, nights, pending)
         except ValueError as error:
             drifted.notes.append(f"{path}: {error}")
     recent = {
@@ -231,19 +268,6 @@ def _rounded(night: Mapping[str, Estimate]) -> dict[str, list[float]]:
     return {key: [round(float(part), 6) for part in estimate] for key, estimate in night.items()}
 
 
-def _used(path: str, result: RecordingTable, segments: Segments) -> str:
-    """What share of a recording is held against production: the samples of its last LONGEST that have every
-    signal; and what is masked or cut."""
-    kinds, messages = result.quality["kind"], result.quality["message"]
-    cut = [str(message).partition(" %")[0] for message in messages[kinds == "cut"]]
-    whole = len(result.record["time_s"]) / (1 - min(float(cut[0]) / 100 if cut else 0.0, 0.99))
-    used = sum(int(np.isfinite(y).all(axis=1).sum()) for _, y in segments)
-    masked = np.mean([column for name, column in result.record.items() if name.endswith("_masked")])
-    why = [f"{cut[0]} % cut: damaged rows"] if cut else []
-    why += [f"{100 * masked:.0f} % masked"] if masked >= 0.005 else []
-    return f"used {100 * used / whole:.0f} % of {Path(path).name}" + (f" ({', '.join(why)})" if why else "")
-
-
 def _least(limits: DriftLimits, explained: Explanation, held: ProductionReference, names: SignalNames) -> str:
     """The smallest changes of a gain and of an offset that would have been an alarm tonight, of the signal
     that is known least."""
@@ -270,17 +294,24 @@ def _silent(drifted: LoopDrift, path: str, reason: str, outputs: Sequence[str]) 
 def _stand_still(
     drifted: LoopDrift, path: str, record: dict[str, np.ndarray], held: ProductionReference, machine: Plant
 ) -> bool:
-    """Whether a sensor stands still in a recording: then that is an alarm, the recording is set aside, and
-    nothing else is asked of it."""
+    """Whether a sensor gives no number or stands still in a recording: then that is an alarm, the recording
+    is set aside, and nothing else is asked of it. Readings in °F or K are out of limits as well: no alarm."""
     readings = _last(judge.segments(record, machine, masked=False))
     noise = np.exp(held.own.noise.mean(axis=0) / 2)
     found = sensors.faults(held.machine.plant, machine, readings, noise=noise, steps=held.steps)
+    if not found:
+        return False
+    if all(fault.kind == sensors.OPEN for fault in found):
+        names = SignalNames([i.name for i in machine.inputs], [o.name for o in machine.outputs])
+        mistake = mistakes.found(held.machine, readings, held.own, inputs=names.inputs, outputs=names.outputs)
+        if mistake:
+            drifted.quarantined[path] = quarantine(path, drifted.loop, f"{path}: {mistake.reason}")
+            return True
     for fault in found:
         _doubt(drifted, path, fault.output, fault.sentence)
-    if found:
-        reason = f"{path}: {found[0].sentence} It says nothing of the machine"
-        drifted.quarantined[path] = quarantine(path, drifted.loop, reason)
-    return bool(found)
+    reason = f"{path}: {found[0].sentence} It says nothing of the machine"
+    drifted.quarantined[path] = quarantine(path, drifted.loop, reason)
+    return True
 
 
 def _doubt(drifted: LoopDrift, path: str, output: str, sentence: str) -> None:
@@ -293,23 +324,29 @@ def _one(
     limits: DriftLimits,
     drifted: LoopDrift,
     path: str,
-    segments: Segments,
+    record: dict[str, np.ndarray],
     held: ProductionReference,
     machine: Plant,
     nights: Nights,
     pending: set[str],
 ) -> LoopDrift:
     """The loop's drift with what one recording says; it joins `nights`."""
+    segments, closed_loop = _last(judge.segments(record, machine)), _closed_loop(record, machine)
     names = SignalNames([i.name for i in machine.inputs], [o.name for o in machine.outputs])
     mistake = mistakes.found(held.machine, segments, held.own, inputs=names.inputs, outputs=names.outputs)
     if mistake:
-        reason = (
-            f"{path}: {mistake.words}: undone, the record fits the champion's model {mistake.better:.0f} "
-            "times better; mend it and put it back"
+        drifted.quarantined[path] = quarantine(path, drifted.loop, f"{path}: {mistake.reason}")
+        segments, closed_loop = mistake.undone, {}
+    measured = _measure(limits, segments, held, closed_loop, names)
+    if not mistake and (doubt := _doubtful(measured, segments, held, names)):
+        if doubt.wrong:
+            drifted.quarantined[path] = quarantine(path, drifted.loop, f"{path}: {doubt.words}")
+            return drifted
+        if not measured.found:
+            drifted.notes.append(f"{path}: {doubt.words}, and no single change explains it")
+        measured = measured._replace(
+            found=[one._replace(words=f"{one.words}; or {doubt.words}") for one in measured.found]
         )
-        drifted.quarantined[path] = quarantine(path, drifted.loop, reason)
-        segments = mistake.undone
-    measured = _measure(limits, segments, held, machine, names)
     drifted.figures[path] = measured.figures
     drifted.notes.append(f"{Path(path).name} would have shown {measured.least}")
     nights.append(NightChanges({found.key: found.estimate for found in measured.found}, measured.seeming))
@@ -399,17 +436,59 @@ def _worth(estimate: Estimate) -> float:
 class RecordingDrift(NamedTuple):
     """Of one recording: figures for the page, what changed, what each change would be where none is named,
     and what the closed loop does otherwise beyond what those changes and the air around bring. `least` says
-    which changes would have shown."""
+    which changes would have shown; `misfit` is the mean squared error that is left, in that of the champion's
+    own."""
 
     figures: RecordingFigures
     found: list[RecordingChange]
     seeming: dict[str, Estimate]
     loop: list[CameraChange]
     least: str
+    misfit: float
+
+
+class Doubt(NamedTuple):
+    """That a record may not be of this machine, in words; `wrong`: it is set aside, and no cause is named."""
+
+    words: str
+    wrong: bool
+
+
+def _doubtful(
+    measured: RecordingDrift, segments: Segments, held: ProductionReference, names: SignalNames
+) -> Doubt | None:
+    """None where the causes that were named can be, and explain the record. A heater that is dead looks like
+    commands that are written too large: a gain that fell is told with the mistake beside it."""
+    cannot_be = [one for one in measured.found if _cannot_be(one)]
+    unexplained = measured.misfit > UNEXPLAINED * mistakes.honest(held.own)
+    if not cannot_be and not unexplained and len(measured.found) < drift.MOST:
+        return None
+    likeliest = mistakes.likeliest(
+        held.machine, segments, held.own, inputs=names.inputs, outputs=names.outputs
+    )
+    words = "this record does not fit the machine"
+    if likeliest.better >= WORTH_NAMING:
+        words += (
+            f": likeliest mistake: {likeliest.words}; undone, it fits {likeliest.better:.0f} times better"
+        )
+    fell = [one for one in cannot_be if one.kind.startswith("gain") and one.estimate.amount < 0]
+    return Doubt(words, likeliest.better >= LIKELY and not fell)
+
+
+def _cannot_be(found: RecordingChange) -> bool:
+    """Whether no machine changes so within a night."""
+    kind, amount = found.kind.split(" or ")[0], found.estimate.amount
+    if kind == "ambient":
+        return not COLDEST_DEGC < ROOM_DEGC + amount < HOTTEST_DEGC
+    return abs(amount) > {"gain": MOST_GAIN_PERCENT, "offset": MOST_OFFSET_DEGC}.get(kind, np.inf)
 
 
 def _measure(
-    limits: DriftLimits, segments: Segments, held: ProductionReference, machine: Plant, names: SignalNames
+    limits: DriftLimits,
+    segments: Segments,
+    held: ProductionReference,
+    closed_loop: Mapping[str, list[list[float]]],
+    names: SignalNames,
 ) -> RecordingDrift:
     own, asked = held.own, drift.causes(held.machine.plant)
     record, explained = drift.explain_segments(
@@ -421,12 +500,14 @@ def _measure(
     if abs(air) > limits.ambient_degC:
         found.append(_air(limits, air, record, held))
     effect = drift.moved(record, own.changes, explained.changes) + abs(air)
-    loop = _loop(limits, _closed_loop(segments, machine), held, names, effect, asked=not found)
+    loop = _loop(limits, closed_loop, held, names, effect, asked=not found)
     figures = RecordingFigures(
         _parameters(record, explained, held, names), noise, loop.figures, loop.not_applicable
     )
     seeming, least = _seeming(record, explained, held, names), _least(limits, explained, held, names)
-    return RecordingDrift(figures, [*found, *louder], seeming, loop.causes, least)
+    samples = sum(int(one.measured.sum()) for one in record.segments)
+    misfit = float(explained.left @ explained.left) / max(samples, 1)
+    return RecordingDrift(figures, [*found, *louder], seeming, loop.causes, least, misfit)
 
 
 def _seeming(
@@ -541,7 +622,8 @@ def _words(cause: DriftCause, amount: float, name: str, cap: float) -> str:
             f"{name} reads {amount:+.1f} °C from what it did: its offset, or the heat lost there, has changed"
         )
     verb, word = ("reads" if kind == "late sensor" else "acts"), ("later" if amount > 0 else "earlier")
-    return f"{name} {verb} {abs(amount):.1f} s {word} than it did"
+    clock = ", or the clock of the outputs is off against that of the inputs" if cause.channel < 0 else ""
+    return f"{name} {verb} {abs(amount):.1f} s {word} than it did{clock}"
 
 
 def _air(limits: DriftLimits, air: float, record: DriftRecord, held: ProductionReference) -> RecordingChange:
@@ -601,25 +683,49 @@ def _parameters(
 # ---- the closed loop
 
 
-def _closed_loop(segments: Segments, machine: Plant) -> dict[str, list[list[float]]]:
-    """Offset of each output from its reference after the first third in °C, root mean square of each input
-    and its share of samples at a limit, both in percent: [figures, their standard deviations], from PARTS of
-    the record, which are longer than what a loop remembers."""
-    u, y = (np.concatenate([pair[k] for pair in segments]) for k in (0, 1))
-    reference, low, high = (
-        np.array([o.reference for o in machine.outputs]),
-        *np.array([(i.low, i.high) for i in machine.inputs]).T,
+def _closed_loop(record: Mapping[str, np.ndarray], machine: Plant) -> dict[str, list[list[float]]]:
+    """Offset of each output from its set-point where it is settled in °C, root mean square of each input and
+    its share of samples at a limit, both in percent, and the settled set-points in °C: [figures, their
+    standard deviations], from PARTS of the record, which are longer than what a loop remembers. Empty where
+    nothing is settled."""
+    u, y = (_last_of(record, signals) for signals in (machine.inputs, machine.outputs))
+    wanted = np.column_stack(
+        [
+            record.get(set_point_of(o.name), np.full(len(record["time_s"]), o.reference))[-LONGEST:]
+            for o in machine.outputs
+        ]
     )
-    late, limited = (y - reference)[len(y) // 3 :], 100.0 * ((u <= low + 1e-9) | (u >= high - 1e-9))
-    effort = np.sqrt((u**2).mean(axis=0))
+    settled = _settled(wanted)
+    if settled.sum() < PARTS * SHORTEST:
+        return {}
+    low, high = np.array([(i.low, i.high) for i in machine.inputs]).T
+    limited = 100.0 * ((u <= low + 1e-9) | (u >= high - 1e-9))
+    mean_square, deviation = np.array(_mean(u**2))
+    effort = np.sqrt(mean_square)
     return {
-        "offset_degC": _mean(late),
-        "effort_percent": [
-            effort.tolist(),
-            (np.array(_mean(u**2)[1]) / np.maximum(2 * effort, 1e-9)).tolist(),
-        ],
+        "offset_degC": _mean((y - wanted)[settled]),
+        "effort_percent": [effort.tolist(), (deviation / np.maximum(2 * effort, 1e-9)).tolist()],
         "at_limits_percent": _mean(limited),
+        "set_point_degC": [wanted[settled].mean(axis=0).tolist(), [0.0] * len(machine.outputs)],
     }
+
+
+def _last_of(record: Mapping[str, np.ndarray], signals: Sequence[PlantSignal]) -> np.ndarray:
+    """(T, k) of the last LONGEST samples; NaN where one is masked."""
+    columns = [np.where(record[f"{s.name}_masked"], np.nan, record[s.name]) for s in signals]
+    return np.column_stack(columns)[-LONGEST:].astype(float)
+
+
+def _settled(wanted: np.ndarray) -> np.ndarray:
+    """Where (T,) a loop has had time to reach its set-points (T, p): the last two thirds of a stretch of
+    SHORTEST samples or more in which none is changed. No set-point, or 0, is a heater that is off."""
+    changes = np.flatnonzero((np.diff(wanted, axis=0) != 0).any(axis=1)) + 1
+    edges = [0, *changes.tolist(), len(wanted)]
+    settled = np.zeros(len(wanted), bool)
+    for begin, end in itertools.pairwise(edges):
+        if end - begin >= SHORTEST:
+            settled[begin + (end - begin) // 3 : end] = True
+    return settled & (wanted > 0).all(axis=1)
 
 
 def _mean(values: np.ndarray) -> list[list[float]]:
@@ -652,15 +758,22 @@ def _loop(
     """Offset, effort and share at limits against the champion's own nights; not asked where those were not
     settled at the references. `effect` (p,) are the °C that the changes of the machine and the air around
     bring: what they explain is not counted again; `asked` is whether the machine is as it was."""
-    usual = {key: np.array([night[key] for night in held.loop]) for key in now}
+    nights = [night for night in held.loop if night]
+    if not now or not nights:
+        return LoopChanges({}, [], "no stretch is settled at a set-point")
+    usual = {key: np.array([night[key] for night in nights]) for key in now}
     offset = usual["offset_degC"][:, 0].mean(axis=0)
-    unsure = np.sqrt((usual["offset_degC"][:, 1] ** 2).mean(axis=0) / len(held.loop))
+    unsure = np.sqrt((usual["offset_degC"][:, 1] ** 2).mean(axis=0) / len(nights))
     if (np.abs(offset) > SETTLED * limits.offset_degC + 2 * unsure).any():
         return LoopChanges(
             {}, [], "the champion's own recordings are not of a loop settled at the references"
         )
     figures, causes = {}, []
+    aims = usual["set_point_degC"][:, 0]
+    elsewhere = np.abs(now["set_point_degC"][0] - aims).min(axis=0).max() > limits.offset_degC
     for key, (sentence, least, allowed) in _asked(limits, held, names, effect).items():
+        if elsewhere and key != "offset_degC":  # other set-points take other duties
+            continue
         of = names.outputs if key == "offset_degC" else names.inputs
         moved = _loop_shift(now[key], usual[key], least)
         for k, (name, by) in enumerate(zip(of, moved.value - moved.reference, strict=True)):

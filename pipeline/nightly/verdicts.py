@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.nightly import judge
-from pipeline.nightly.processes import STATE, dvc
+from pipeline.nightly.processes import dvc
 from pipeline.nightly.records import Night
 from pipeline.nightly.remembered import METRICS
 from pipeline.nightly.settings import Nightly
@@ -54,7 +54,7 @@ def _make_pages_agree(pages: Mapping[str, Verdict], night: Night) -> Night:
     if all(shown.get(loop) == verdict.metrics() for loop, verdict in pages.items()):
         return night
     try:
-        dvc("repro", "--single-item", "--force", "report", log=STATE / "logs" / f"{night.run}-report.log")
+        dvc("repro", "--single-item", "--force", "report")
     except ValueError as error:
         return night.noted(f"the pages are not of tonight ({error}); run ./run dvc repro --force report")
     return night

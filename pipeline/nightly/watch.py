@@ -1,9 +1,11 @@
 """Who is woken, and when nobody ran: the alarm's JSON file, its command and webhook, the heartbeat, and the
 age of the last success."""
 
+import contextlib
 import datetime
 import json
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -16,9 +18,11 @@ import urllib.request
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from pipeline.nightly.processes import STATE
+import yaml
+
+from pipeline.nightly.processes import STATE, git
 from pipeline.nightly.settings import Nightly
-from pipeline.store import artifacts
+from pipeline.store import artifacts, params
 
 ALARM = STATE / "alarm.json"
 # a try at a server, the pause before the second, and the alarm's command: all that waking may take is bounded
@@ -33,22 +37,30 @@ class Routes(NamedTuple):
     heartbeat: str = ""
 
 
-def routes(known: Nightly | None) -> Routes:
-    """Those of the environment, so that no secret stands in a file; otherwise those of the parameters, where
-    these can be read."""
-    written = Routes(known.alarm, known.webhook, known.heartbeat) if known else Routes()
+def find_routes(settings: Nightly | None) -> Routes:
+    """Those of the environment, so that no secret stands in a file; otherwise those of the parameters, or if
+    these are broken, of the last commit whose parameters can be read."""
+    written = settings.model_dump() if settings else _read_committed()
     return Routes(
-        *(os.environ.get(f"BEADLINE_{key.upper()}") or getattr(written, key) for key in Routes._fields)
+        *(os.environ.get(f"BEADLINE_{key.upper()}") or str(written.get(key, "")) for key in Routes._fields)
     )
 
 
-def shown(settings: Nightly) -> Nightly:
+def _read_committed() -> dict[str, Any]:
+    revisions = git("rev-list", "-n", "20", "HEAD", "--", params.FILE, check=False).split()
+    for revision in ("HEAD", *revisions):
+        with contextlib.suppress(yaml.YAMLError, KeyError, TypeError, ValueError):
+            return dict(yaml.safe_load(git("show", f"{revision}:{params.FILE}", check=False))["nightly"])
+    return {}
+
+
+def hide_secrets(settings: Nightly) -> Nightly:
     """The settings as a page may show them: of a URL the server, of a command its first word."""
-    told = routes(settings)
+    routes = find_routes(settings)
     public = {
-        "webhook": _server(told.webhook),
-        "heartbeat": _server(told.heartbeat),
-        "alarm": _word(told.alarm),
+        "webhook": _server(routes.webhook),
+        "heartbeat": _server(routes.heartbeat),
+        "alarm": _word(routes.alarm),
     }
     return settings.model_copy(update=public)
 
@@ -75,10 +87,10 @@ def hours_since(when: str, now: datetime.datetime) -> float:
     return (now - datetime.datetime.fromisoformat(when)).total_seconds() / 3600
 
 
-def overdue(now: datetime.datetime, success: str | None, watch_h: float) -> str:
+def find_overdue(now: datetime.datetime, success: str, watch_h: float) -> str:
     """Why somebody should look: the last success is older than `watch_h` hours,
     or lies in the future; empty where all is well."""
-    if success is None:
+    if not success:
         return "no night has ever succeeded; run ./run beadline nightly, and look at its schedule"
     age_h = hours_since(success, now)
     if age_h < -0.1:
@@ -97,39 +109,42 @@ def overdue(now: datetime.datetime, success: str | None, watch_h: float) -> str:
 # ---- waking
 
 
-def wake(kind: str, reasons: Sequence[str], details: Mapping[str, Any], told: Routes) -> list[str]:
+def wake(kind: str, reasons: Sequence[str], details: Mapping[str, Any], routes: Routes) -> list[str]:
     """Writes the alarm, runs the command with its path, posts it to the webhook; what went wrong on the way,
     as sentences, for an alarm that fails must not hide the night."""
-    said = _for_chat(f"beadline: {details.get('night', 'nightly')}: {kind}: {'; '.join(reasons)}")
-    alarm = {"schema": "alarm", "version": 1, "kind": kind, "text": said, "reasons": list(reasons), **details}
-    text = json.dumps(alarm, indent=2, ensure_ascii=False, default=str)
+    chat = escape_for_chat(f"beadline: {details.get('night', 'nightly')}: {kind}: {'; '.join(reasons)}")
+    alarm = {"schema": "alarm", "version": 1, "kind": kind, "text": chat, "reasons": list(reasons), **details}
+    text = json.dumps(alarm, indent=2, ensure_ascii=False, default=str).encode("utf-8", "replace")
     troubles = []
     try:
-        artifacts.write_text(ALARM, text + "\n")
+        artifacts.write_bytes(ALARM, text + b"\n")
     except OSError as error:
         troubles.append(f"the alarm could not be written: {error}")
-    if told.alarm and (trouble := _commanded(told.alarm, kind, text.encode("utf-8", "replace"))):
-        troubles.append(f"nightly.alarm: {_word(told.alarm)} {trouble}")
-    if told.webhook and (trouble := _asked(told.webhook, text.encode("utf-8", "replace"))):
-        troubles.append(f"nightly.webhook: {_server(told.webhook)}: {trouble}")
+    if routes.alarm and (trouble := _command(routes.alarm, kind, text)):
+        troubles.append(f"nightly.alarm: {_word(routes.alarm)} {trouble}")
+    if routes.webhook and (trouble := _ask(routes.webhook, text)):
+        troubles.append(f"nightly.webhook: {_server(routes.webhook)}: {trouble}")
     return troubles
 
 
-def _for_chat(text: str) -> str:
-    """A text in which Slack and Mattermost find no tag, mention, link or picture: names of files are
-    anybody's. What must be broken is broken by a space that nobody sees."""
-    for sign, shown in (("&", "&amp;"), ("<", "&lt;"), (">", "&gt;"), ("@", "@\u200b"), ("](", "]\u200b(")):
-        text = text.replace(sign, shown)
-    return text
+# signs that are markup in Slack or Mattermost, and others that look like them and are none
+PLAIN = {"&": "&amp;", "<": "&lt;", ">": "&gt;", "*": "\u2217", "`": "\u02cb", "~": "\u223c", "@": "@\u200b"}
 
 
-def beat(told: Routes) -> list[str]:
+def escape_for_chat(text: str) -> str:
+    """A text in which Slack and Mattermost find no tag, mention, link, picture or emphasis: names of files
+    are anybody's. An underscore is markup at the edge of a word alone, so that shift_12 stays what it is."""
+    text = re.sub(r"(?<![^\W_])_|_(?![^\W_])", "\u02cd", text.translate(str.maketrans(PLAIN)))
+    return text.replace("](", "]\u200b(")
+
+
+def beat(routes: Routes) -> list[str]:
     """Tells the heartbeat's URL that a night went well; what went wrong, as sentences."""
-    trouble = _asked(told.heartbeat) if told.heartbeat else ""
-    return [f"nightly.heartbeat: {_server(told.heartbeat)}: {trouble}"] if trouble else []
+    trouble = _ask(routes.heartbeat) if routes.heartbeat else ""
+    return [f"nightly.heartbeat: {_server(routes.heartbeat)}: {trouble}"] if trouble else []
 
 
-def _commanded(command: str, kind: str, alarm: bytes) -> str:
+def _command(command: str, kind: str, alarm: bytes) -> str:
     """Why the command did not do its work, empty where it did. It reads the alarm from its input too, which
     needs no file."""
     with tempfile.TemporaryFile() as said:
@@ -155,15 +170,15 @@ def _commanded(command: str, kind: str, alarm: bytes) -> str:
     return f"ended with status {child.returncode}: {words}" if child.returncode else ""
 
 
-def _asked(url: str, body: bytes | None = None) -> str:
+def _ask(url: str, body: bytes | None = None) -> str:
     """Asks a server, once more after a pause where it fails; why it failed, empty where it did not."""
-    if not (trouble := _tried(url, body)):
+    if not (trouble := _try(url, body)):
         return ""
     time.sleep(PAUSE_S)
-    return _tried(url, body) and f"{trouble} (tried twice)"
+    return _try(url, body) and f"{trouble} (tried twice)"
 
 
-def _tried(url: str, body: bytes | None) -> str:
+def _try(url: str, body: bytes | None) -> str:
     """One try, within ASKED_S: in a thread, for a server's name or its headers byte by byte
     take as long as they like."""
     troubles = [f"no answer within {ASKED_S:g} s"]

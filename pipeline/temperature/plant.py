@@ -77,13 +77,21 @@ def markov_parameters(plant: Plant, lags: int) -> np.ndarray:
 
 
 def clip_spectral_radius(A: np.ndarray, radius: float) -> np.ndarray:
-    """A with every eigenvalue beyond `radius` drawn back onto it along its ray, in the modal basis."""
+    """A with every eigenvalue beyond `radius` drawn back onto it along its ray, in the modal basis, or in
+    Schur's if there is no modal one, as of a plant with dead times."""
     eigenvalues, T = np.linalg.eig(A)
     size = np.abs(eigenvalues)
     if size.max() <= radius:
         return A
     clipped = eigenvalues * np.where(size > radius, radius * (1 - 1e-9) / np.maximum(size, 1e-300), 1.0)
-    A_clipped = np.real((T * clipped) @ np.linalg.inv(T))
+    try:
+        A_clipped = np.real((T * clipped) @ np.linalg.inv(T))
+    except np.linalg.LinAlgError:
+        upper, Z = scipy.linalg.schur(A, output="complex")
+        diagonal = np.diag(upper)
+        shrunk = radius * (1 - 1e-9) / np.maximum(np.abs(diagonal), 1e-300)
+        np.fill_diagonal(upper, diagonal * np.minimum(shrunk, 1.0))
+        A_clipped = np.real(Z @ upper @ Z.conj().T)
     # a defective A has no modal basis to draw in
     return A_clipped * min(1.0, radius * (1 - 1e-9) / np.abs(np.linalg.eigvals(A_clipped)).max())
 

@@ -12,19 +12,9 @@ import pytest
 
 from pipeline.cli import render_night
 from pipeline.deposition.tables import SCORES
-from pipeline.nightly import champion, judge, night, promoting, reporting, screening, verdicts
+from pipeline.nightly import champion, judge, night, promoting, reporting, reproducing, screening, verdicts
 from pipeline.nightly.decision import CaseCosts
-from pipeline.nightly.records import (
-    CANDIDATE,
-    FIRST,
-    KEPT,
-    PROMOTED,
-    Champion,
-    ChampionState,
-    Installed,
-    Lineage,
-    Night,
-)
+from pipeline.nightly.records import CANDIDATE, FIRST, KEPT, PROMOTED, Champion, ChampionState, Lineage, Night
 from pipeline.nightly.settings import Nightly
 from pipeline.report.index import page as index_page
 from pipeline.report.nightly import page as nightly_page
@@ -80,12 +70,13 @@ def project(passing, monkeypatch):
 
     monkeypatch.setattr(judge, "judge", lambda *_: judge.Judge(measure, lambda _: {"worst_case": 0.1}))
     monkeypatch.setattr(screening, "reference", lambda *_: None)
-    monkeypatch.setattr(champion, "removed", lambda _: None)
-    installed = Installed({"md5": "0"})
-    monkeypatch.setattr(
-        champion, "install", lambda _, files, __: installed._replace(files=champion.md5_of(files))
-    )
+    monkeypatch.setattr(champion, "remove", lambda _: None)
+    monkeypatch.setattr(champion, "install", lambda _, files, __: ({"md5": "0"}, md5s(files)))
     return folder
+
+
+def md5s(files) -> dict[str, str]:
+    return {name.removeprefix("datasets/"): champion.md5_of(name) for name in files}
 
 
 def settings(**holdout) -> Nightly:
@@ -99,7 +90,7 @@ def settings(**holdout) -> Nightly:
 
 def other(run="night-0003") -> Champion:
     """A champion or a candidate with other files."""
-    return Champion(run, TONIGHT.when, "", Installed({"md5": "1"}, {"weights.json": "1"}))
+    return Champion(run, TONIGHT.when, "", {"md5": "1"}, {"weights.json": "1"})
 
 
 # ---- metrics files: each rule passed, exactly at its limit, undecided, failed, open
@@ -295,11 +286,11 @@ def test_page_and_night_never_disagree(project, seed):
         {loop: other() for loop in LOOPS if rng.random() < 0.5},
         candidates={loop: other("night-0005") for loop in LOOPS if rng.random() < 0.5},
     )
-    tonight, after = promoting.judged(asked, TONIGHT, before, lineage=Lineage)
+    tonight, after = promoting.judge_all(asked, TONIGHT, before, lineage=Lineage)
     sources = page_sources()
     index = words(index_page.render(sources, judgement(sources)))
     page = nightly_page.render([tonight], after, asked)
-    summary = reporting.summary(tonight, [])
+    summary = reporting.summarise(tonight, [])
     assert {loop: tonight.decisions[loop].verdict.state for loop in LOOPS} == expected
     for loop, decision in tonight.decisions.items():
         verdict, passed = decision.verdict, expected[loop] == PASSED
@@ -366,7 +357,7 @@ def test_a_champion_of_the_heaters_has_a_passed_certificate_of_its_own(
         Path(name).write_text("whole")
     Path("dvc.yaml").write_text(CERTIFYING)
     asked = settings()
-    tonight, after = promoting.judged(asked, TONIGHT, ChampionState(), lineage=Lineage)
+    tonight, after = promoting.judge_all(asked, TONIGHT, ChampionState(), lineage=Lineage)
     Path("dvc.yaml").unlink()
     decision = tonight.decisions["temperature"]
     assert decision.verdict.state == PASSED and decision.promotes == (not why)
@@ -444,7 +435,7 @@ def test_a_contestant_that_is_named_to_run_must_pass_itself(project):
     assert named.state == FAILED and named.subject == "varx_riccati" and named.winner is None
     assert named.sentence == "Fail (simulation). First failed rule: overshoot."
     assert "VARX + Riccati is named to run, and does not pass." in named.reason
-    tonight, after = promoting.judged(
+    tonight, after = promoting.judge_all(
         settings(controller="varx_riccati"), TONIGHT, ChampionState(), lineage=Lineage
     )
     assert tonight.decisions["temperature"].decision == CANDIDATE
@@ -460,7 +451,7 @@ def test_what_runs_stays_where_the_page_finds_nobody_better_beyond_the_bands(pro
     present = other()._replace(contestant="varx_riccati")
     state = ChampionState({"temperature": present})
     artifacts.write_json(NIGHTLY, TONIGHT.metrics(state))
-    tonight, after = promoting.judged(settings(), TONIGHT, state, lineage=Lineage)
+    tonight, after = promoting.judge_all(settings(), TONIGHT, state, lineage=Lineage)
     assert tonight.decisions["temperature"].verdict.winner == "varx_riccati"
     assert after.champions["temperature"].contestant == "varx_riccati"
 
@@ -476,7 +467,7 @@ def test_the_champion_and_the_challenger_are_each_judged_as_their_own_contestant
     verdict = verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"]
     for present in (other()._replace(contestant="pi_simc"), other()):
         state = ChampionState({"temperature": present})
-        promoting.decided(settings(), "temperature", TONIGHT, state, verdict)
+        promoting.judge_loop(settings(), "temperature", TONIGHT, state, verdict)
     # one that was promoted before champion.json said so is what the night judged then
     assert asked == [
         ("datasets", "subspace_lqg"),
@@ -488,13 +479,13 @@ def test_the_champion_and_the_challenger_are_each_judged_as_their_own_contestant
 
 def test_the_same_files_as_another_contestant_are_another_challenger(project):
     verdict = verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"]
-    files = Installed({"md5": "0"}, champion.md5_of(LOOPS["temperature"]))
+    files = md5s(LOOPS["temperature"])
     decisions = {
-        contestant: promoting.decided(
+        contestant: promoting.judge_loop(
             settings(),
             "temperature",
             TONIGHT,
-            ChampionState({"temperature": other()._replace(installed=files, contestant=contestant)}),
+            ChampionState({"temperature": other()._replace(files=files, contestant=contestant)}),
             said,
         ).decision
         for contestant, said in (
@@ -516,7 +507,7 @@ def test_the_same_files_as_another_contestant_are_another_challenger(project):
 
 def test_a_champion_that_would_lack_what_it_is_designed_from_is_not_promoted(project):
     verdict = verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"]._replace(subject="pi_simc")
-    decided = promoting.decided(settings(), "temperature", TONIGHT, ChampionState(), verdict).decision
+    decided = promoting.judge_loop(settings(), "temperature", TONIGHT, ChampionState(), verdict).decision
     assert decided.decision == KEPT and decided.reasons == [
         "pi_simc is designed from datasets/identify_plant/spread.parquet, which the champion would lack; add "
         "it to nightly.loops.temperature.artifacts"
@@ -528,7 +519,7 @@ def test_the_artifacts_hold_what_every_contestant_is_designed_from():
     assert promoting.OPTIONAL <= artifacts_of
     # of these, a record may not determine some
     loop = params.load(Nightly, "nightly", ROOT / "params.yaml").loops["temperature"]
-    assert set(loop.artifacts) - set(promoting.there(loop)) == {
+    assert set(loop.artifacts) - set(promoting.list_files(loop)) == {
         path for path in promoting.OPTIONAL if not Path(path).is_file()
     }
 
@@ -559,15 +550,15 @@ def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(play
 
     def a_night(number, files, state):
         artifact = Path("datasets/compose_parts/x")
-        artifact.parent.mkdir(parents=True, exist_ok=True)
 
-        def reproduced(_, run):
+        def reproduce(_, log, **__):
             # the pages that the stages make show the drift of this very night
-            assert artifacts.read_json(NIGHTLY)["run"] == run == f"night-{number:04d}"
+            assert artifacts.read_json(NIGHTLY)["run"] == log.stem == f"night-{number:04d}"
+            artifact.parent.mkdir(parents=True, exist_ok=True)
             artifact.write_text(files)
-            return {}, ()
+            return {}, []
 
-        monkeypatch.setattr(night, "_reproduce", reproduced)
+        monkeypatch.setattr(reproducing, "reproduce", reproduce)
         verdict = Verdict("deposition", state, *words_of[state], "", "", "", "basis", subject="basis")
         verdict = verdict._replace(rehearsal=True)
         monkeypatch.setattr(
@@ -575,7 +566,7 @@ def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(play
         )
         Path("learn.py").write_text(f"# night {number}\n")
         status, summary = night.nightly(render_night)
-        assert status == night.OK, summary
+        assert status == reporting.OK, summary
         return summary, json.loads(played.run("git", "show", "HEAD:champion.json").stdout)
 
     summary, state = a_night(1, "one", FAILED)
@@ -597,13 +588,13 @@ def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(play
     _, state = a_night(3, "two", FAILED)
     assert state["candidates"]["deposition"]["run"] == "night-0003"
     assert played.production_of("deposition.candidate") == {"compose_parts/x": b"two"}
-    # a killed night's candidate is put back as it was committed
+    # the folder follows what the last commit says
     Path("champion/deposition.candidate/compose_parts/x").write_text("half")
-    assert any("put back to night-0003" in sentence for sentence in champion.as_committed())
+    assert champion.follow() == ["champion/deposition.candidate is that of night-0003"]
     assert played.production_of("deposition.candidate") == {"compose_parts/x": b"two"}
     summary, state = a_night(4, "two", PASSED)
     assert "promoted deposition" in summary and "candidate" not in summary
-    assert "candidates" not in state and state["champions"]["deposition"]["rehearsal"]
+    assert state["candidates"] == {} and state["champions"]["deposition"]["rehearsal"]
     assert state["champions"]["deposition"]["contestant"] == "basis"
     assert played.production_of("deposition") == {"compose_parts/x": b"two"}
     assert not Path("champion/deposition.candidate").exists()
@@ -616,5 +607,5 @@ def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(play
     assert played.production_of("deposition") == {"compose_parts/x": b"two"}
     page = words(Path("reports/nightly.html").read_text())
     assert "Nothing is promoted: deposition does not pass." in page and "Fail (simulation)." in page
-    assert champion.as_committed() == []
+    assert champion.follow() == []
     assert not [line for line in played.dirty() if "champion" in line]

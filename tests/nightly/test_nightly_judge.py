@@ -9,7 +9,7 @@ import yaml
 from pipeline.deposition.tables import SCORES
 from pipeline.nightly import judge, promoting
 from pipeline.nightly.decision import FIRST, KEPT, PROMOTED, CaseCosts, decide
-from pipeline.nightly.records import Champion, ChampionState, Installed, Night
+from pipeline.nightly.records import Champion, ChampionState, Night
 from pipeline.nightly.settings import HoldOut, Nightly, NightlyLoop
 from pipeline.report.nightly import page as nightly_page
 from pipeline.setpoint import tables
@@ -106,10 +106,10 @@ def test_a_champion_that_cannot_be_designed_is_named_and_stays(project, name, we
     with pytest.raises(judge.NotComparable, match=sentence) as refused:
         judge.judge(settings.loops["temperature"], settings).measure(Path("champion/temperature"))
     assert "\n" not in str(refused.value)
-    present = Champion("night-0001", "", "", Installed({"md5": "0"}))
+    present = Champion("night-0001", "", "", {"md5": "0"})
     state = ChampionState({"temperature": present})
     quiet = Night(2, "night-0002", "2030-01-01T02:00:00+00:00")
-    decided = promoting.decided(settings, "temperature", quiet, state, None).decision
+    decided = promoting.judge_loop(settings, "temperature", quiet, state, None).decision
     assert decided.decision == KEPT and "cannot be compared: " in decided.reasons[0]
 
 
@@ -172,6 +172,13 @@ def test_a_part_s_chosen_composer_is_its_case(project):
     assert evidence.cases == {"a, A": ("a, A", 1.0), "b, A": ("b, A", 2.0)} and evidence.guards == {
         "worst_line_volume_percent": 0.5
     }
+    # a challenger whose lines are not judged has no worst line, and is no better for it
+    columns["worst_line_volume_percent"] = [np.nan, 90.0, np.nan]
+    artifacts.write_table("datasets/compose_parts/scores.parquet", SCORES, columns)
+    unjudged = judge._deposition(Path("datasets"))
+    assert unjudged.guards == {}
+    decision = decide(evidence, unjudged, project.rule, allowed={}, alarms=(), seed=1)
+    assert decision.decision == KEPT and "guard worst_line_volume_percent is inf" in str(decision.reasons)
 
 
 def test_a_setpoint_case_costs_the_runs_that_do_not_settle(project):

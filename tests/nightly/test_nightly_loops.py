@@ -10,18 +10,18 @@ import pytest
 from pipeline.cli import render_night
 from pipeline.deposition.tables import SCORES
 from pipeline.nightly import (
-    accepting,
+    by_hand,
     champion,
     inputs,
     night,
     remembered,
     reporting,
+    reproducing,
     screening,
     verdicts,
     watch,
 )
-from pipeline.nightly.records import Alarm, LoopDrift, Night, NightDrift
-from pipeline.nightly.remembered import DriftMemory
+from pipeline.nightly.records import Alarm, DriftMemory, LoopDrift, Night, NightDrift, Remembered, to_json
 from pipeline.nightly.settings import Nightly
 from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
@@ -56,9 +56,13 @@ def passing(loop: str) -> tuple[str, Verdict]:
     return loop, Verdict(loop, PASSED, *said, winner="ours", subject="ours", rehearsal=True)
 
 
-def played(*_: None) -> tuple[dict, tuple]:
+def remember(memory: Remembered) -> None:
+    artifacts.write_json(remembered.LAST, to_json(memory))
+
+
+def played(*_: None) -> tuple[dict, list]:
     """Stages that did what they were played to do."""
-    return {}, ()
+    return {}, []
 
 
 def deposition(cost: float, guard: float) -> None:
@@ -115,15 +119,14 @@ def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_gua
         (10.0, 2.0, "kept", "the challenger is no better"),
     ]
     for k, (cost, guard, decision, reason) in enumerate(nights):
-        monkeypatch.setattr(night, "_reproduce", lambda *_, of=(cost, guard): played(score(*of)))
+        monkeypatch.setattr(reproducing, "reproduce", lambda *_, of=(cost, guard), **__: played(score(*of)))
         project.record(f"night {k}", [10.0])
         Path("learn.py").write_text(f"# night {k}\n")  # something is new
         status, summary = night.nightly(render_night)
         decided = remembered.nights()[-1].decisions[loop]
-        assert status == night.OK and decided.decision == decision and reason in " ".join(decided.reasons), (
-            summary,
-            decided,
-        )
+        assert (
+            status == reporting.OK and decided.decision == decision and reason in " ".join(decided.reasons)
+        ), (summary, decided)
         assert champion.read().champions[loop].run == ("night-0005" if k >= 4 else "night-0001")
     # production holds what was promoted, not what was scored last, and says on what it was judged
     present = champion.read().champions[loop]
@@ -135,26 +138,26 @@ def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_gua
 def test_a_loop_that_is_switched_off_is_no_part_of_the_night(project, monkeypatch):
     own = {loop: {"judge": loop, "cases": "", "recordings": "", "artifacts": LOOPS[loop]} for loop in LOOPS}
     alarm = Alarm("setpoint", "setpoint: ink", "a print", "the ink looks different", 9.0)
-    monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0), setpoint(10.0, 2.0)))
-    remembered.remember(
-        remembered.Remembered(drift=DriftMemory(alarms=(alarm,)), recordings={"setpoint": {}})
+    monkeypatch.setattr(
+        reproducing, "reproduce", lambda *_, **__: played(deposition(10.0, 2.0), setpoint(10.0, 2.0))
     )
+    remember(Remembered(drift=DriftMemory(alarms=(alarm,)), recordings={"setpoint": {}}))
     project.set(loops_on={"setpoint": False}, loops=own)
     status, summary = night.nightly(render_night)
     tonight = remembered.nights()[-1]
-    assert status == night.OK and tonight.promoted == ("deposition",), summary
+    assert status == reporting.OK and tonight.promoted == ("deposition",), summary
     assert "no part of the night, by section loops: setpoint" in summary
     assert list(tonight.decisions) == list(champion.read().champions) == ["deposition"]
     assert not tonight.drift.alarms
     # switched on, the night has it again
     project.set(loops=own)
     status, summary = night.nightly(render_night)
-    assert status == night.OK and "promoted setpoint" in summary and "no part" not in summary
+    assert status == reporting.OK and "promoted setpoint" in summary and "no part" not in summary
     # without any there is nothing to do
     project.set(loops_on=dict.fromkeys(own, False), loops=own)
-    monkeypatch.setattr(night, "_reproduce", lambda *_: pytest.fail("no stage is asked"))
+    monkeypatch.setattr(reproducing, "reproduce", lambda *_, **__: pytest.fail("no stage is asked"))
     status, summary = night.nightly(render_night)
-    assert status == night.OK and "section loops switches off every loop" in summary
+    assert status == reporting.OK and "section loops switches off every loop" in summary
 
 
 def test_every_section_of_the_parameters_is_checked_before_the_first_stage(project, monkeypatch):
@@ -162,9 +165,9 @@ def test_every_section_of_the_parameters_is_checked_before_the_first_stage(proje
     project.set(loops={"deposition": own})
     written = Path("params.yaml").read_text()
     Path("params.yaml").write_text(written.replace('"max_order"', '"max_ordre"'))
-    monkeypatch.setattr(night, "_reproduce", lambda *_: pytest.fail("no stage is asked"))
+    monkeypatch.setattr(reproducing, "reproduce", lambda *_, **__: pytest.fail("no stage is asked"))
     status, summary = night.nightly(render_night)
-    assert status == night.FAILED and "max_ordre" in summary and "max_order" in summary
+    assert status == reporting.FAILED and "max_ordre" in summary and "max_order" in summary
     assert "max_ordre" in Path("reports/nightly.html").read_text()
 
 
@@ -185,15 +188,15 @@ def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(
         camera |= sections["camera"]
     said = json.loads(Path("params.yaml").read_text())
     Path("params.yaml").write_text(json.dumps(said | {"camera": camera}))
-    monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0)))
+    monkeypatch.setattr(reproducing, "reproduce", lambda *_, **__: played(deposition(10.0, 2.0)))
     status, summary = night.nightly(render_night)
-    assert status == night.OK, summary
+    assert status == reporting.OK, summary
     broken = Path("datasets/raw/deposition/trial_7.mcap")
     broken.parent.mkdir(parents=True)
     broken.write_bytes(b"\x89MCAP0\r\n half a file")
     Path("learn.py").write_text("# something else is new\n")
     status, summary = night.nightly(render_night)
-    assert status == night.QUARANTINED == 4 and "trial_7.mcap" in summary, summary
+    assert status == reporting.QUARANTINED == 4 and "trial_7.mcap" in summary, summary
     assert not broken.exists() and (inputs.QUARANTINE / "deposition/trial_7.mcap").read_bytes().endswith(
         b"half a file"
     )
@@ -223,27 +226,22 @@ def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project,
             }
         }
     )
-    monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0)))
-    assert night.nightly(render_night)[0] == night.OK
+    monkeypatch.setattr(reproducing, "reproduce", lambda *_, **__: played(deposition(10.0, 2.0)))
+    assert night.nightly(render_night)[0] == reporting.OK
     with pytest.raises(
         ValueError,
         match="expected a loop with a champion and a drift alarm, found none; loops with an alarm: none",
     ):
-        accepting.accept("deposition", "a new camera")
+        by_hand.accept("deposition", "a new camera")
     before = project.production_of("deposition")
-    # as version 0.1 wrote it
-    memory = {
-        "alarms": [{"loop": "deposition"}],
-        "pending": ["deposition: camera"],
-        "drifted": {"deposition": ["trial_8.mcap"]},
-    }
-    artifacts.write_json(remembered.LAST, artifacts.read_json(remembered.LAST) | {"drift": memory})
+    memory = DriftMemory(("deposition: camera",), drifted={"deposition": ["trial_8.mcap"]})
+    remember(remembered.last()._replace(drift=memory))
     monkeypatch.setattr(
         screening,
         "reference",
         lambda loop, folder, only: {"schema": "reference", "version": 1, "camera": list(only)},
     )
-    assert "is held against trial_8.mcap from now on" in accepting.accept("deposition", "a new camera")
+    assert "is held against trial_8.mcap from now on" in by_hand.accept("deposition", "a new camera")
     after = project.production_of("deposition")
     assert artifacts.read_json("champion/deposition/reference.json")["camera"] == ["trial_8.mcap"]
     assert {name: after[name] for name in before} == before and remembered.last().drift.drifted == {
@@ -260,19 +258,23 @@ def test_an_alarm_of_the_setpoint_camera_changes_nothing_for_another_loop(projec
         for loop in ("deposition", "setpoint")
     }
     project.set(loops=both)
-    monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0), setpoint(10.0, 2.0)))
-    assert night.nightly(render_night)[0] == night.OK
+    monkeypatch.setattr(
+        reproducing, "reproduce", lambda *_, **__: played(deposition(10.0, 2.0), setpoint(10.0, 2.0))
+    )
+    assert night.nightly(render_night)[0] == reporting.OK
     raised = Alarm(
         "setpoint", "setpoint: contrast", "print_8.csv", "the line stands out by 25 gray levels", 9.0
     )
     memory = DriftMemory((), (raised,), {"setpoint": ["print_8.csv"]}, night=1)
-    remembered.remember(remembered.last()._replace(drift=memory))
-    monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(5.0, 2.0), setpoint(5.0, 2.0)))
+    remember(remembered.last()._replace(drift=memory))
+    monkeypatch.setattr(
+        reproducing, "reproduce", lambda *_, **__: played(deposition(5.0, 2.0), setpoint(5.0, 2.0))
+    )
     Path("learn.py").write_text("# something is new\n")
     status, summary = night.nightly(render_night)
     tonight = remembered.nights()[-1]
     # the setpoint loop, whose camera it is, keeps its champion; the other is promoted as on any night
-    assert status == night.DRIFTED and tonight.promoted == ("deposition",), summary
+    assert status == reporting.DRIFTED and tonight.promoted == ("deposition",), summary
     assert tonight.drift.of("setpoint").alarms == [raised] and tonight.drift.of("deposition").alarms == []
     assert not any("drift" in reason for reason in tonight.decisions["deposition"].reasons)
     assert "drift: the line stands out" in " ".join(tonight.decisions["setpoint"].reasons)

@@ -61,7 +61,7 @@ def test_a_night_pushes_to_s3_and_a_fresh_clone_has_the_champion_bit_by_bit(serv
     project.set(remote="store")
     project.run("git", "commit", "-qam", "a remote")
     ended = project.night()
-    assert ended.returncode == 0 and "not on remote" not in ended.stdout, ended
+    assert ended.returncode == 0 and "is not on the remote" not in ended.stdout, ended
     project.run("git", "clone", "-q", str(project.folder), str(tmp_path / "clone"))
     clone = Project(tmp_path / "clone")
     clone.env = project.env

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.nightly import drift, inputs, screening, temperature_drift
-from pipeline.nightly.records import SENSOR, Alarm
+from pipeline.nightly import drift, inputs, judge, screening, temperature_drift
+from pipeline.nightly.records import SENSOR, Alarm, RecordShare
 from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Nightly
 from pipeline.recordings import plain_files
@@ -312,6 +312,29 @@ def test_swapped_sensors_are_set_aside_with_the_reason_beside_them(look):
     )
 
 
+def test_readings_in_kelvin_are_past_every_limit_and_yet_no_broken_sensor(look):
+    good = nights.a_night(1, 301)
+    result = look(good | {name: good[name] + 273.15 for name in ("sensor_1", "sensor_2")})
+    assert result.drift.alarms == []
+    assert "every sensor is in K where °C is declared" in result.drift.quarantined[str(NEW)]
+
+
+def test_a_cause_that_cannot_be_is_a_wrong_record_with_its_likeliest_mistake(look):
+    """Wrong in two ways: no single mistake leaves an honest record, so none is believed by itself."""
+    good = nights.a_night(1, 302)
+    fahrenheit = {name: 1.8 * good[name] + 32 for name in ("sensor_1", "sensor_2")}
+    result = look(good | fahrenheit | {"heater_2": 0.8 * good["heater_2"]})
+    reason = result.drift.quarantined[str(NEW)]
+    assert result.drift.alarms == [] and "this record does not fit the machine: likeliest mistake: " in reason
+    assert re.search(r"°F where °C is declared.*; undone, it fits \d+ times better$", reason)
+
+
+def test_a_heater_that_is_dead_is_an_alarm_and_no_mistake_of_the_record(look):
+    result = look(nights.a_night(1, 303, gain=(0.04, 1.0)))
+    assert any("gain from heater_1 has changed by -9" in alarm.cause for alarm in result.drift.alarms)
+    assert result.drift.quarantined == {}
+
+
 def test_a_night_without_recordings_keeps_the_alarm_of_the_one_before(look):
     cause = "the gain from heater_1 has changed by -10 %"
     alarm = Alarm("temperature", "temperature: plant at heater_1", "shift_8.csv", cause, -9.0)
@@ -425,6 +448,13 @@ def test_a_sensor_that_stands_still_is_the_first_alarm_and_its_record_is_set_asi
     assert result.memory.drifted == {"temperature": []}  # nobody may accept it as how things are
 
 
+def test_a_coarse_sensor_that_a_good_loop_holds_still_and_that_moves_again_is_not_dead(look):
+    shift = nights.a_night(1, 740)
+    still = shift["sensor_2"].copy()
+    still[200:330] = still[200]
+    assert [a for a in look(shift | {"sensor_2": still}).drift.alarms if a.kind == SENSOR] == []
+
+
 def test_good_shifts_with_coarse_sensors_are_no_dead_sensors(look):
     for k in range(4):
         shift = nights.a_night(1, 720 + k)
@@ -435,9 +465,12 @@ def test_good_shifts_with_coarse_sensors_are_no_dead_sensors(look):
 def test_a_night_says_what_it_used_and_what_would_have_shown(look):
     shift = nights.a_night(1, 730)
     silent = np.where((np.arange(600) >= 300) & (np.arange(600) < 320), np.nan, shift["sensor_2"])
-    used, shown = look(shift | {"sensor_2": silent}).drift.notes
+    (shown,) = look(shift | {"sensor_2": silent}).drift.notes
+    nights.write(NEW, shift | {"sensor_2": silent})
+    share = judge.measure_shares(params.load(Nightly, "nightly"), [str(NEW)])[str(NEW)]
+    NEW.unlink()
     # 20 of 600 samples lack a signal, one of four
-    assert used == "used 97 % of new.csv (1 % masked)"
+    assert share == RecordShare(used_percent=96.7, masked_percent=0.8, cut_percent=0.0)
     found = re.fullmatch(
         r"new.csv would have shown a gain of heater_\d from (\S+) % on "
         r"and an offset of sensor_\d from (\S+) °C on",

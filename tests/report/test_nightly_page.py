@@ -3,7 +3,7 @@ narrow, light and dark; hostile names do nothing."""
 
 import pytest
 
-from pipeline.nightly.records import ChampionState, Night
+from pipeline.nightly.records import ChampionState, Night, from_json
 from pipeline.nightly.settings import Nightly
 from pipeline.report.nightly import page as nightly_page
 from pipeline.store import params
@@ -19,7 +19,6 @@ DRIFT = {
     "mean_sigmas": -6.2} for k in (1, 2)},
     "closed_loop": {"sensor_1 offset_degC": {"moved": -1.4, "sigmas": -1.1},
     "heater_1 effort_percent": {"moved": 9.4, "sigmas": 5.1}},
-    "notes": [],
 }  # fmt: skip
 JUDGED = {
     "decision": "kept",
@@ -31,24 +30,24 @@ JUDGED = {
     "unstable_plants": {"champion": 0.0, "challenger": 0.0, "allowed": 0.0}},
 }  # fmt: skip
 ALARM = {
-    "night": 2, "run": "night-0002", "when": "2030-01-09T02:00:00+00:00", "outcome": "kept",
+    "number": 2, "run": "night-0002", "when": "2030-01-09T02:00:00+00:00", "outcome": "kept",
     "notes": ["the clock was set back by 3 h"], "seconds": 8.0,
     "new_recordings": {"temperature": [FILE]},
     "quarantined": {FILE: f"{FILE}: 3 columns, 5 expected <script>alert(1)</script>"},
     "decisions": {"temperature": JUDGED},
     "promoted": [], "reasons": [],
-    "drift": {
+    "drift": {"loops": {"temperature": {"loop": "temperature",
         "alarms": [{"loop": "temperature", "key": "k", "recording": FILE, "cause": CAUSE, "sigmas": -9.4,
         "consequences": ["closed loop: sensor_1 settles -1.4 °C off"]}],
-        "watched": [], "figures": {FILE: DRIFT},
-    },
+        "watched": [], "figures": {FILE: DRIFT}, "quarantined": {}, "notes": [],
+    }}},
 }  # fmt: skip
 FIRST = ALARM | {
-    "night": 1, "run": "night-0001", "when": "2030-01-08T02:00:00+00:00", "outcome": "promoted",
+    "number": 1, "run": "night-0001", "when": "2030-01-08T02:00:00+00:00", "outcome": "promoted",
     "promoted": ["temperature"], "quarantined": {}, "notes": [],
     "decisions": {"temperature": {"decision": "first champion",
     "reasons": ["there was no champion to compare with"], "guards": {}}},
-    "drift": {"alarms": [], "watched": [], "figures": {}},
+    "drift": {"loops": {}},
 }  # fmt: skip
 ENTRY = {
     "run": "night-0001",
@@ -76,8 +75,8 @@ STATE = {
 def alarm(tmp_path):
     """The folder with the page of an alarm night."""
     settings = params.load(Nightly, "nightly", ROOT / "params.yaml")
-    nights = [Night.read(row) for row in (FIRST, ALARM)]
-    html = nightly_page.render(nights, ChampionState.read(STATE), settings)
+    nights = [from_json(Night, row) for row in (FIRST, ALARM)]
+    html = nightly_page.render(nights, from_json(ChampionState, STATE), settings)
     (tmp_path / "nightly.html").write_text(html, encoding="utf-8")
     (tmp_path / "machine.js").write_text(MACHINE)
     return tmp_path
@@ -123,9 +122,13 @@ def test_a_sensor_that_stands_still_is_the_pages_first_sentence_and_its_first_al
         "loop": "temperature", "key": "k", "recording": FILE, "sigmas": 99.9, "kind": "sensor",
         "cause": "sensor_2 stands still at 110.0 °C while heater_2 heats.", "channel": "sensor_2",
     }  # fmt: skip
-    night = ALARM | {"drift": ALARM["drift"] | {"alarms": [*ALARM["drift"]["alarms"], dead]}}
+    measured = ALARM["drift"]["loops"]["temperature"]
+    alarms = {"alarms": [*measured["alarms"], dead]}
+    night = ALARM | {"drift": {"loops": {"temperature": measured | alarms}}}
     settings = params.load(Nightly, "nightly", ROOT / "params.yaml")
-    html = nightly_page.render([Night.read(FIRST), Night.read(night)], ChampionState.read(STATE), settings)
+    html = nightly_page.render(
+        [from_json(Night, FIRST), from_json(Night, night)], from_json(ChampionState, STATE), settings
+    )
     assert "Check sensor_2 before the machine heats again; the champions stay." in html
     assert html.index("sensor_2 stands still at 110.0") < html.index("gain from heater_1 has changed")
     assert "Alarm: a sensor stands still." in html and "99.9" not in html

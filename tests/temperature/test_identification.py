@@ -26,6 +26,7 @@ from pipeline.temperature.identification.refinement import (
 )
 from pipeline.temperature.identification.subspace import lagged
 from pipeline.temperature.plant import baam, markov_parameters, plant, simulate
+from tests.foreign import records
 from tests.temperature.moesp import moesp, moesp_singular_values, varx
 
 
@@ -307,6 +308,14 @@ def test_a_refined_plant_stays_within_the_radius_that_was_asked_for():
     true, u, y = two_zones(600, noise=1.0)
     refined, _ = refine(true, [u], [y], criterion="simulation", settings=FitSettings(max_radius=0.97))
     assert np.abs(np.linalg.eigvals(refined.A)).max() <= 0.97
+
+
+@pytest.mark.parametrize("kind", ["robot_arm", "flutter", "disc_player_arm", "two_heaters", "barrel"])
+def test_the_predictor_is_stable_at_an_order_that_is_too_low(kind):
+    u, y = records.RECORDS[kind](np.random.default_rng([0, 77]))
+    for order in (2, 3, 4):
+        found = identify([u], [y], sample_time_s=1.0, settings=Settings(order=order)).plant
+        assert np.abs(np.linalg.eigvals(found.A - found.K @ found.C)).max() < 1
 
 
 def test_masked_samples_are_counted_and_do_not_bend_the_plant():

@@ -12,6 +12,7 @@ from pipeline.temperature.plant import (
     at_disturbances,
     baam,
     bandwidth_rad_s,
+    clip_spectral_radius,
     controllability,
     hold_output,
     hold_state,
@@ -199,3 +200,13 @@ def test_the_bandwidth_of_a_first_order_plant_is_one_over_its_time_constant():
     assert bandwidth_rad_s(plant([[0.0]], [[1.0]], [[1.0]])) is None
     for restless in (1.0, 1.01):
         assert bandwidth_rad_s(plant([[restless]], [[1.0]], [[1.0]])) is None
+
+
+def test_a_plant_with_dead_times_has_its_slow_pole_drawn_back_and_its_dead_times_kept():
+    lag = np.zeros((4, 4))
+    lag[0, 0], lag[0, 3] = 1.001, -0.5
+    lag[2, 1] = lag[3, 2] = 1.0  # three samples of dead time: a chain without a modal basis
+    clipped = clip_spectral_radius(lag, 0.999)
+    assert np.sort(np.abs(np.linalg.eigvals(clipped)))[-1] <= 0.999
+    np.testing.assert_allclose(clipped[1:], lag[1:], atol=1e-12)
+    np.testing.assert_allclose(clipped[0], [0.999, 0, 0, -0.5], atol=5e-3)

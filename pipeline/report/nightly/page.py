@@ -17,6 +17,7 @@ from pipeline.nightly.records import (
     HistoryLine,
     LoopDecision,
     Night,
+    RecordShare,
 )
 from pipeline.nightly.settings import Nightly
 from pipeline.report.shared import charts, page
@@ -66,6 +67,7 @@ def render(nights: Sequence[Night], state: ChampionState, settings: Nightly) -> 
         history=[_line(line) for line in reversed(state.history)],
         quarantined=tonight.quarantined,
         notes=tonight.notes,
+        used=[_used(path, share, tonight) for path, share in tonight.used.items()],
         watch=_watch(nights, settings),
         rule=_rule(settings),
         state=_head(tonight)[1],
@@ -161,7 +163,7 @@ def _remedy(night: Night, drifted: Sequence[str]) -> str:
             f"The log is .beadline/logs/{night.run}.log; mend the cause, and the next night works."
         ),
         records.PROMOTED: (
-            f"To put it into production: ./run beadline nightly --merge {night.branch}."
+            f"To put it into production: git merge {night.branch}; the next night brings it."
             if night.branch
             else "To go back: ./run beadline rollback."
         ),
@@ -204,16 +206,16 @@ def _champions(champions: Mapping[str, Champion]) -> list[dict[str, str]]:
 def _exported(champion: Champion) -> str:
     """The certified controller in a champion's folder, with the hash of its certificate; empty where it has
     none."""
-    files = champion.installed.files
-    found = next((path for path in files if path.endswith("/certificate.json")), "")
-    folder = found.removesuffix("certificate.json")
-    if not found or f"{folder}controller.json" not in files:
+    files = champion.files
+    certificate = next((path for path in files if path.endswith("/certificate.json")), "")
+    folder = certificate.removesuffix("certificate.json")
+    if not certificate or f"{folder}controller.json" not in files:
         return ""
-    return f"{folder}controller.json, certificate {files[found][:8]}"
+    return f"{folder}controller.json, certificate {files[certificate][:8]}"
 
 
 def _decision(name: str, decision: LoopDecision) -> dict[str, Any]:
-    guards = [_guard(guard, figures) for guard, figures in (decision.guards or {}).items()]
+    guards = [_guard(guard, figures) for guard, figures in decision.guards.items()]
     return {
         "loop": name,
         "decision": decision.decision,
@@ -271,6 +273,14 @@ def _rule(settings: Nightly) -> str:
         "no guard worse than is allowed, on a night without drift; otherwise the champion stays. What does "
         "not pass the rules of its loop's page is a candidate: kept in champion/LOOP.candidate, and not run."
     )
+
+
+def _used(path: str, share: RecordShare, night: Night) -> dict[str, str]:
+    """How much of a new recording was used, and the smallest changes that it could have shown."""
+    figures = night.drift.figures.get(path)
+    parts = (share.used_percent, share.masked_percent, share.cut_percent)
+    columns = dict(zip(("used", "masked", "cut"), (quantity(part, "%", 0) for part in parts), strict=True))
+    return {"recording": path, **columns, "least": figures.least if figures else ""}
 
 
 # ---- drift
@@ -397,7 +407,7 @@ def _row(night: Night) -> dict[str, Any]:
         "outcome": night.outcome,
         "new": sum(map(len, night.new_recordings.values())),
         "reasons": "; ".join([*(cause for cause in causes if cause not in reasons), reasons]),
-        "seconds": number(night.seconds or 0, 0),
+        "seconds": number(night.seconds, 0),
     }
 
 

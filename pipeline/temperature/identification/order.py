@@ -330,7 +330,7 @@ def fit(
     # a mode may grow 20-fold over the longest segment while a plant is refined, no more
     radius = settings.max_radius or float(np.exp(3.0 / max(map(len, u))))
     if kind == "subspace":
-        return stabilised(start, radius) if settings.max_radius else start
+        return with_stable_predictor(stabilised(start, radius) if settings.max_radius else start, u, y)
     start = stabilised(start, radius)
     if kind == "simulation":
         linear = fit_inputs(start.A, start.C, u, y, feedthrough=settings.feedthrough, offset=settings.offset)
@@ -357,9 +357,17 @@ def _refined(
     kind: Criterion, start: Plant, u: Segments, y: Segments, settings: FitSettings, radius: float
 ) -> Plant:
     """`refine` with every pole within `radius`, from a start whose predictor may not be stable."""
-    if kind == "prediction" and np.abs(np.linalg.eigvals(start.A - start.K @ start.C)).max() >= 1:
-        start = kalman_gain(start, u, y)
+    if kind == "prediction":
+        start = with_stable_predictor(start, u, y)
     return refine(start, u, y, kind, settings._replace(max_radius=radius * (1 + 1e-12)))[0]
+
+
+def with_stable_predictor(plant: Plant, u: Segments, y: Segments) -> Plant:
+    """The plant as it is where A - K C is stable, else with the Kalman gain of the record: the errors of an
+    unstable predictor grow without limit."""
+    if np.abs(np.linalg.eigvals(plant.A - plant.K @ plant.C)).max() < 1:
+        return plant
+    return kalman_gain(plant, u, y)
 
 
 def cross_validate(

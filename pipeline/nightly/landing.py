@@ -1,0 +1,172 @@
+"""How a night lands: one commit of what it made in its copy, one tag a loop that it promoted, all references
+in one step; then the project is brought to the commit, production last. A note in .beadline says what is on
+its way, so that the next night, or a rollback, finishes what was killed in between."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+
+from pipeline.nightly import champion, inputs, worktree
+from pipeline.nightly.processes import STATE, configure, git, identity, names
+from pipeline.nightly.records import from_json, to_json
+from pipeline.nightly.worktree import COPY, Snapshot
+from pipeline.store import artifacts
+
+NOTE = STATE / "landing.json"
+# on the disk before the night says so: git's default leaves loose objects in memory
+DURABLE = {"core.fsync": "all"}
+
+
+class Landing(NamedTuple):
+    """A commit on its way into the project: the branch, and what it was before; the project's files when the
+    night began; tags by name; recordings that are set aside, {path: (loop, reason, digest)}; lists of those
+    that stay, {path: text}."""
+
+    commit: str
+    branch: str
+    before: str
+    files: str
+    tags: Mapping[str, str]
+    quarantined: Mapping[str, tuple[str, str, str]] = {}
+    lists: Mapping[str, str] = {}
+
+
+def get_branch() -> str:
+    """The reference of the branch that is checked out. Raises ValueError if there is none: what is committed
+    there is lost with the next checkout."""
+    branch = git("symbolic-ref", "-q", "HEAD", check=False)
+    if not branch:
+        raise ValueError(
+            "expected a branch to be checked out, found a detached HEAD, where the night's commit would be "
+            "lost; git switch to the branch that is in production, and run it again"
+        )
+    return branch
+
+
+def check_head(snapshot: Snapshot, places: Sequence[str]) -> str:
+    """The present commit of HEAD. Raises ValueError if one since the snapshot holds something below
+    `places`, which the night is made from or writes."""
+    head = git("rev-parse", "HEAD")
+    for name in names("diff", "--name-only", "--no-renames", snapshot.head, head):
+        if any(name == place or inputs.within(name, place) for place in places):
+            raise ValueError(
+                f"{name} was committed while the night ran; nothing is changed, and the next night works "
+                "from it"
+            )
+    return head
+
+
+def commit(paths: Sequence[str], message: str, parents: Sequence[str]) -> str:
+    """A commit of these paths as they lie in the copy over the tree of the first parent; empty if nothing
+    differs. No reference and no index of anybody's changes."""
+    index = STATE / "index"
+    env = {"GIT_INDEX_FILE": str(index.resolve())} | configure(DURABLE)
+    git("read-tree", parents[0], env=env, place=COPY)
+    tracked = names("ls-files", "--", *paths, env=env, place=COPY)
+    existing = [
+        path
+        for path in paths
+        if (COPY / path).exists() or any(name == path or inputs.within(name, path) for name in tracked)
+    ]
+    # nothing that git ignores, or that lies behind a link to another disk
+    existing = [path for path in existing if not git("check-ignore", path, check=False, place=COPY)]
+    existing = [
+        path for path in existing if not any((COPY / p).is_symlink() for p in (path, *Path(path).parents))
+    ]
+    if existing:
+        git("add", "-A", "--", *existing, env=env, place=COPY)
+    tree = git("write-tree", env=env, place=COPY)
+    index.unlink()
+    if tree == git("rev-parse", f"{parents[0]}^{{tree}}"):
+        return ""
+    ancestors = [word for parent in parents for word in ("-p", parent)]
+    return git("commit-tree", tree, *ancestors, "-m", message, env=identity() | configure(DURABLE))
+
+
+def move(references: Mapping[str, tuple[str, str]], message: str) -> None:
+    """Moves references {name: (new, old)}, all or none; an old one of "" is not asked. Raises ValueError if
+    one has moved meanwhile."""
+    lines = [f"update {name} {new} {old}".rstrip() for name, (new, old) in references.items()]
+    text = "\n".join(["start", *lines, "prepare", "commit", ""])
+    git("update-ref", "-m", message, "--stdin", text=text, env=configure(DURABLE))
+
+
+def land(landing: Landing, message: str) -> None:
+    """Moves the branch and the tags to the commit; `finish` brings the project to it."""
+    artifacts.write_json(NOTE, to_json(landing))
+    tags = {name: (commit, "") for name, commit in landing.tags.items()}
+    move({landing.branch: (landing.commit, landing.before)} | tags, message)
+
+
+def finish() -> list[str]:
+    """Brings the project to a commit that a night made, as far as somebody has not edited the same files
+    since; forgets one that its branch never came to. What was done, as sentences."""
+    if not NOTE.exists():
+        return []
+    landing = from_json(Landing, artifacts.read_json(NOTE))
+    if git("merge-base", landing.commit, landing.branch, check=False) != landing.commit:
+        for name in landing.tags:
+            git("update-ref", "-d", name, landing.commit, check=False)
+        NOTE.unlink()
+        return []
+    for name, commit in landing.tags.items():
+        git("update-ref", name, commit)
+    notes = []
+    if landing.branch == git("symbolic-ref", "-q", "HEAD", check=False):
+        notes += _bring_files(landing)
+        worktree.checkout(_changed_stages(landing))
+    set_aside(landing.quarantined, landing.lists)
+    champion.follow()
+    NOTE.unlink()
+    return notes
+
+
+def _bring_files(landing: Landing) -> list[str]:
+    """Brings the files of the commit into the project and its index."""
+    paths = names("diff", "--name-only", "--no-renames", landing.before, landing.commit)
+    deleted = names("diff", "--name-only", "--no-renames", "--diff-filter=D", landing.before, landing.commit)
+    staged = {*names("diff", "--cached", "--name-only", "--no-renames", landing.before)}
+    # no reference holds that commit: a clean-up of git may have taken it
+    files = git("rev-parse", "-q", "--verify", f"{landing.files}^{{commit}}", check=False) or landing.before
+    edited = {*names("diff", "--name-only", "--no-renames", files)}
+    tracked = {*names("ls-tree", "-r", "--name-only", files)}
+    # what git did not know when the night began, a new recording, lies there already
+    bring = [name for name in paths if name not in edited and (name in tracked or not Path(name).exists())]
+    for name in (name for name in bring if name in deleted):
+        Path(name).unlink(missing_ok=True)
+    written = [name for name in bring if name not in deleted]
+    _call_with_paths("checkout", "-q", landing.commit, paths=written)
+    unstaged = [name for name in paths if name not in staged and name not in written]
+    _call_with_paths("reset", "-q", landing.commit, paths=unstaged)
+    differing = {*names("diff", "--name-only", "--no-renames", landing.commit)}
+    return [
+        f"{name} was edited meanwhile and is left as it is"
+        for name in paths
+        if name in edited and name in differing
+    ]
+
+
+def _changed_stages(landing: Landing) -> list[str]:
+    """The stages that ran: DVC's cache has their outs."""
+    before, after = (
+        (yaml.safe_load(git("show", f"{commit}:dvc.lock", check=False) or "{}") or {}).get("stages", {})
+        for commit in (landing.before, landing.commit)
+    )
+    return [name for name, entry in after.items() if before.get(name) != entry]
+
+
+def _call_with_paths(*command: str, paths: Sequence[str]) -> None:
+    if paths:
+        git(*command, "--pathspec-from-file=-", "--pathspec-file-nul", text="\0".join(paths))
+
+
+def set_aside(quarantined: Mapping[str, tuple[str, str, str]], lists: Mapping[str, str]) -> None:
+    """Sets the project's recordings aside, each if it is still what was judged, and lists those that stay."""
+    for path, text in lists.items():
+        if not Path(path).exists() or Path(path).read_text(encoding="utf-8") != text:
+            artifacts.write_text(path, text)
+    for path, (loop, reason, digest) in quarantined.items():
+        if Path(path).exists() and artifacts.sha256(path) == digest:
+            inputs.move_aside(path, loop, reason)

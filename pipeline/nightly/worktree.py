@@ -1,0 +1,181 @@
+"""The throw-away copy in which a night works: a git worktree below .beadline, at the files as they lie in the
+project, with the recordings, DVC's cache and the memos of the project. Killed at any moment, it has changed
+nothing."""
+
+import contextlib
+import fcntl
+import os
+import shutil
+import time
+from collections.abc import Generator, Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from pipeline.nightly.processes import (
+    STATE,
+    TOKEN,
+    configure,
+    dvc,
+    end_orphans,
+    git,
+    identity,
+    names,
+    remove_stale_locks,
+)
+from pipeline.nightly.reproducing import read_stages
+from pipeline.store import artifacts
+
+LOCK, COPY = STATE / "lock", STATE / "copy"
+LINKED = ("datasets/raw", "datasets/holdout")
+# a younger recording may still grow: it is copied as it is, and the next night finds it changed
+YOUNG_S = 600.0
+
+
+class BusyError(ValueError):
+    """Another night is at work."""
+
+
+class Snapshot(NamedTuple):
+    """The commit of HEAD when a night began, and one of the tracked files as they lay in the project then."""
+
+    head: str
+    files: str
+
+
+@contextlib.contextmanager
+def locked() -> Generator[None]:
+    """The night's lock; the kernel lets go if a process dies. Raises BusyError if another night has it."""
+    if STATE.exists() and not STATE.is_dir():
+        raise ValueError(
+            f"{STATE}: expected the folder in which nights are remembered, found a file; "
+            "move it away, and run it again"
+        )
+    STATE.mkdir(exist_ok=True)
+    if not (STATE / ".gitignore").exists():
+        artifacts.write_text(STATE / ".gitignore", "*\n")
+    descriptor = os.open(LOCK, os.O_RDWR | os.O_CREAT)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.environ[TOKEN] = str(Path.cwd())
+        yield
+    except BlockingIOError:
+        raise BusyError(
+            "another night is at work; this one changed nothing; run it again when that has ended"
+        ) from None
+    finally:
+        os.environ.pop(TOKEN, None)
+        os.close(descriptor)
+
+
+# ---- the copy
+
+
+def take() -> Snapshot:
+    """Raises ValueError if the project is no repository of its own, or a merge is half done in it."""
+    head = git("rev-parse", "--verify", "-q", "HEAD", check=False)
+    if not head or git("rev-parse", "--show-prefix"):
+        raise ValueError(
+            "expected a git repository in this folder with at least one commit, found none; run git init, "
+            "and commit the project"
+        )
+    if unmerged := names("diff", "--name-only", "--diff-filter=U"):
+        raise ValueError(f"{unmerged[0]}: a merge is half done in git; finish it, and run it again")
+    return Snapshot(head, git("stash", "create", env=identity()) or head)
+
+
+def make(snapshot: Snapshot, sources: Iterable[str]) -> None:
+    """The copy with all that a night needs: the files that git has or does not have yet, `sources` among
+    them; recordings; memos; the outs of the stages."""
+    make_bare(snapshot)
+    for place in LINKED:
+        if (COPY / place).is_symlink():
+            (COPY / place).unlink()
+        shutil.rmtree(COPY / place, ignore_errors=True)
+        if Path(place).exists():
+            link(Path(place), COPY / place)
+    for name in (*names("ls-files", "--others", "--exclude-standard"), *sources):
+        if Path(name).is_file() and not (COPY / name).exists():
+            (COPY / name).parent.mkdir(parents=True, exist_ok=True)
+            link(Path(name), COPY / name)
+    memo = Path("datasets/memo")
+    memo.mkdir(parents=True, exist_ok=True)
+    (COPY / memo).parent.mkdir(exist_ok=True)
+    (COPY / memo).symlink_to(memo.resolve())
+    with contextlib.chdir(COPY), contextlib.suppress(ValueError):  # what no cache has is made anew
+        checkout([*read_stages("dvc.lock")], *map(str, Path("champion").glob("*.dvc")))
+
+
+def make_bare(snapshot: Snapshot) -> None:
+    """The copy with the files that git has, and DVC's settings."""
+    remove()
+    # hooks, as DVC's own, are of the checkout and not of the copy
+    quiet = configure({"core.hooksPath": "/dev/null"})
+    # twice: also over one that was killed while git made it
+    twice = ("--force", "--force")
+    git("worktree", "add", "--quiet", "--detach", *twice, str(COPY), snapshot.files, env=quiet)
+    _share_dvc()
+
+
+def checkout(stages: Sequence[str], *pointers: str) -> None:
+    """Brings the outs of these stages as dvc.lock has them, and those of these pointers. Raises ValueError
+    if one is in no cache."""
+    wired, locked_stages = read_stages("dvc.yaml"), read_stages("dvc.lock")
+    known = [name for name in stages if name in wired and name in locked_stages]
+    if known or pointers:
+        dvc("checkout", "--quiet", "--force", *known, *pointers)
+
+
+def _share_dvc() -> None:
+    """DVC works in the copy with the project's cache and remotes, whose paths are absolute here."""
+    from dvc.config import Config
+
+    shared = Config(dvc_dir=str(Path(".dvc").resolve()))
+    local = Path(".dvc/config.local")
+    if local.exists():
+        shutil.copyfile(local, COPY / local)
+    folder = str(shared["cache"].get("dir") or Path(".dvc/cache").resolve())
+    cache = {**shared["cache"], "dir": folder, "type": ["reflink", "hardlink", "copy"]}
+    (COPY / ".dvc/cache").symlink_to(folder)
+    with Config(dvc_dir=str((COPY / ".dvc").resolve())).edit("local") as settings:
+        settings["cache"] = cache
+        settings["remote"] = {name: dict(remote) for name, remote in shared["remote"].items()}
+    # by its age DVC names the folder in which it keeps what it has hashed: the same every night
+    btime = COPY / ".dvc/tmp/btime"
+    btime.parent.mkdir(exist_ok=True)
+    btime.touch()
+    os.utime(btime, (0, 0))
+
+
+def link(source: Path, target: Path) -> None:
+    """The tree of `source` made of hard links: DVC adds nothing below a folder that is a link itself. On
+    another disk a file is a link; a folder that is one stays one."""
+    if source.is_dir() and source.is_symlink():
+        target.symlink_to(source.resolve())
+    elif source.is_dir():
+        target.mkdir(parents=True, exist_ok=True)
+        for entry in source.iterdir():
+            link(entry, target / entry.name)
+    elif 0 <= time.time() - source.stat().st_mtime < YOUNG_S:
+        shutil.copy2(source, target)
+    else:
+        try:
+            os.link(source, target)
+        except OSError:
+            target.symlink_to(source.resolve())
+
+
+def remove() -> None:
+    """Nothing is left of the copy."""
+    shutil.rmtree(COPY, ignore_errors=True)
+    git("worktree", "prune", check=False)
+
+
+def clear_killed() -> list[str]:
+    """Ends and removes what a killed night left, as sentences."""
+    if not COPY.exists():
+        return []
+    ended = end_orphans()
+    remove_stale_locks()
+    remove()
+    running = f" and had left {ended} processes running; they were ended" if ended else ""
+    return [f"the night before was killed{running}"]

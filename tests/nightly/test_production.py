@@ -1,0 +1,205 @@
+"""The way back to an earlier champion, recordings that git or DVC keeps, and what a change runs again."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pipeline.cli import render_night
+from pipeline.nightly import champion, inputs, night, processes, reporting
+from pipeline.nightly.records import Champion, ChampionState
+from pipeline.recordings import excluded
+from pipeline.store import artifacts, params
+from pipeline.verdict import verdict
+from tests.conftest import ROOT
+from tests.nightly.toy_nights import SETTINGS, Project, entered
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    return Project(tmp_path_factory.mktemp("production") / "toy").make().promoted()
+
+
+@pytest.fixture
+def project(first, tmp_path, monkeypatch):
+    return entered(first, tmp_path / "toy", monkeypatch)
+
+
+def put(state: ChampionState, run: str, loop: str = "toy", event: str = "promoted") -> ChampionState:
+    return champion.promote(state, loop, Champion(run, run, "", {"md5": f"{loop} {run}"}), event=event)
+
+
+def back(state: ChampionState, run: str = "", loop: str = "") -> ChampionState:
+    for name, former in champion.find_earlier(state, run, loop).items():
+        state = champion.promote(state, name, former, event="rolled back", when="by hand")
+    return state
+
+
+def present(state: ChampionState, loop: str = "toy") -> str:
+    return state.champions[loop].run
+
+
+def test_rollback_twice_goes_two_back_and_what_was_rolled_back_is_not_come_back_to():
+    state = ChampionState()
+    for run in ("n1", "n2", "n3"):
+        state = put(state, run)
+    once = back(state)
+    assert present(once) == "n2" and present(back(once)) == "n1"
+    with pytest.raises(ValueError, match="expected an earlier champion to go back to, found none"):
+        back(back(once))
+    # after n4 was promoted in the place of n3, the one before it is n2
+    later = put(once, "n4")
+    assert present(back(later)) == "n2" and present(back(back(later))) == "n1"
+    # one that was left is put back by its name alone; before it is what it then replaced
+    again = back(later, "n3")
+    assert present(again) == "n3" and present(back(again)) == "n4"
+    assert present(back(back(state, "n1"), "n3")) == "n3"
+
+
+def test_rollback_takes_back_the_last_promotions_of_all_loops_in_their_order():
+    state = ChampionState()
+    for loop, run in (("a", "n1"), ("b", "n1"), ("b", "n2"), ("a", "n3"), ("b", "n4")):
+        state = put(state, run, loop)
+    course = []
+    for _ in range(3):
+        state = back(state)
+        course.append((present(state, "a"), present(state, "b")))
+    assert course == [("n3", "n2"), ("n1", "n2"), ("n1", "n1")]
+    assert present(back(put(state, "n5", "a"), loop="a"), "a") == "n1"
+
+
+def test_an_accepted_drift_is_the_same_champion_on_the_way_back():
+    state = put(put(ChampionState(), "n1"), "n2")
+    accepted = state.champions["toy"]._replace(folder={"md5": "with another reference"})
+    state = champion.promote(state, "toy", accepted, event="drift accepted")
+    assert present(back(state)) == "n1"
+
+
+# ---- what git or DVC keeps is left where it lies
+
+
+def with_deposition(project: Project, **changes) -> Path:
+    """A loop whose recordings are looked at without a champion; its folder."""
+    loop = {
+        "judge": "deposition", "cases": "", "recordings": "datasets/raw/deposition",
+        "artifacts": ["datasets/segment_library/library.parquet"],
+    }  # fmt: skip
+    project.set(loops=SETTINGS["loops"] | {"deposition": loop}, **changes)
+    change_params(project)
+    raw = project.folder / "datasets/raw/deposition"
+    raw.mkdir(parents=True, exist_ok=True)
+    undecided = verdict.Verdict("deposition", verdict.OPEN, "Undecided (simulation).", "", "", "", "", None)
+    verdict.write({"deposition": undecided}, project.folder / "datasets/verdict")
+    project.run("git", "add", "-A")
+    project.run("git", "commit", "-qm", "another loop")
+    return raw
+
+
+def change_params(project: Project, **nightly) -> None:
+    """Keys of section nightly changed, beside the sections that the pages of the other loops go by."""
+    sections = params.read(ROOT / "params.yaml")
+    sections["nightly"] = json.loads((project.folder / "params.yaml").read_text())["nightly"] | nightly
+    (project.folder / "params.yaml").write_text(json.dumps(sections, indent=1))
+
+
+BROKEN = b"\x89MCAP0\r\n half a file"
+
+
+@pytest.mark.parametrize("kept_by", ["git", "DVC"])
+def test_a_recording_that_git_or_dvc_keeps_stays_is_excluded_and_alarms_once(project, kept_by):
+    raw = with_deposition(project)
+    (raw / "kept.mcap").write_bytes(BROKEN)
+    if kept_by == "DVC":
+        project.run(sys.executable, "-m", "dvc", "add", "-q", "datasets/raw/deposition")
+    project.run("git", "add", "-A")
+    project.run("git", "commit", "-qm", "a recording")
+    (raw / "dropped.mcap").write_bytes(BROKEN)
+    status, summary = night.nightly(render_night)
+    assert status == reporting.QUARANTINED and f"kept.mcap ({kept_by} keeps it" not in summary
+    assert (
+        f"({kept_by} keeps it: it stays, and is listed in datasets/raw/deposition/excluded.yaml)" in summary
+    )
+    assert (raw / "kept.mcap").read_bytes() == BROKEN and not (raw / "dropped.mcap").exists()
+    assert (inputs.QUARANTINE / "deposition/dropped.mcap").exists()
+    entry = excluded.read_list(raw)["kept.mcap"]
+    assert entry["sha256"] == artifacts.sha256(raw / "kept.mcap") and "kept.mcap" in entry["reason"]
+    assert excluded.readable([raw / "kept.mcap", raw / "other.mcap"], raw) == [raw / "other.mcap"]
+    # the list is committed with the recordings, and no night speaks of it again
+    assert project.dirty() == []
+    assert "nothing new" in night.nightly(render_night)[1]
+    change_params(project, watch_h=40)
+    status, summary = night.nightly(render_night)
+    assert status == reporting.OK and "kept.mcap" not in summary
+    # mended, it is a new recording, and looked at again
+    (raw / "kept.mcap").write_bytes(BROKEN + b" mended")
+    assert night.nightly(render_night)[0] == reporting.QUARANTINED
+
+
+def test_who_keeps_a_recording_goes_by_its_own_name_and_not_by_a_pattern(project):
+    kept, dropped = project.record("shift 1", [11.0]), project.record("shift [1]", [11.0])
+    project.run("git", "add", str(kept))
+    assert inputs.keeper(kept.relative_to(project.folder)) == "git"
+    assert inputs.keeper(dropped.relative_to(project.folder)) == ""
+    inputs.quarantine(str(dropped.relative_to(project.folder)), "toy", "far off")
+    assert kept.exists() and (inputs.QUARANTINE / "toy/shift [1].csv").exists()
+
+
+# ---- paths and stages
+
+
+@pytest.mark.parametrize(
+    "name", ["a b.py", "ü.py", 'quo"te.py', "new\nline.py", " leading.py", "dvc.lock", "x -> y.py"]
+)
+def test_a_changed_path_is_named_whole_whatever_its_characters(tmp_path, monkeypatch, name):
+    project = Project(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    project.run("git", "init", "-q", "-b", "main")
+    for file in (name, "zz.py"):
+        (tmp_path / file).write_text("1")
+    project.run("git", "add", "-A")
+    project.run("git", "-c", "user.name=S", "-c", "user.email=s@e", "commit", "-qm", "files")
+    (tmp_path / name).write_text("2")
+    assert processes.changed() == [name]
+    project.run("git", "mv", "zz.py", "moved.py")
+    assert set(processes.changed()) == {name, "zz.py", "moved.py"}
+    (tmp_path / "new.py").write_text("")
+    assert processes.changed("new.py") == [] and processes.changed("new.py", untracked="all") == ["new.py"]
+
+
+WIRING = yaml.safe_load((ROOT / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
+
+
+def depending_on(place: str) -> set[str]:
+    """The stages that may run again where something below `place` is new, by the project's own wiring."""
+
+    def outs(stage: str) -> list[str]:
+        every = [*WIRING[stage].get("outs", []), *WIRING[stage].get("metrics", [])]
+        return [out if isinstance(out, str) else next(iter(out)) for out in every]
+
+    touched, stages = [place], set()
+    while touched:
+        here = touched.pop()
+        for stage in WIRING.keys() - stages:
+            deps = WIRING[stage].get("deps", [])
+            if any(f"{dep}/".startswith(f"{here}/") or f"{here}/".startswith(f"{dep}/") for dep in deps):
+                stages.add(stage)
+                touched += outs(stage)
+    return stages
+
+
+@pytest.mark.parametrize(
+    ("loop", "stages"),
+    [
+        (
+            "temperature",
+            "ingest identify_plant learn_kernel generate_probing tune_weights evaluate_temperature "
+            "certify verdict export_controllers report",
+        ),
+        ("deposition", "train_ilc segment_library compose_parts verdict export_controllers report"),
+        ("setpoint", "train_classifier evaluate_setpoint certify verdict export_controllers report"),
+    ],
+)
+def test_a_new_recording_reruns_the_stages_of_its_own_loop_and_the_pages(loop, stages):
+    assert depending_on(f"datasets/raw/{loop}") == set(stages.split())
