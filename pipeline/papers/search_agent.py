@@ -7,10 +7,9 @@ Validation runs alone choose checkpoint, setting and seed: the runs that an agen
 """
 
 import itertools
-from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, cast
 
 import jax
 import joblib
@@ -57,7 +56,7 @@ class TrainAgent(Section):
     history: int = Field(ge=1, le=1000)
 
 
-def training(settings: TrainAgent, chosen: Mapping[str, Any]) -> agent.PublishedTraining:
+def training(settings: TrainAgent, chosen: dict[str, Any]) -> agent.PublishedTraining:
     """These settings with a choice of SEARCH, as the method takes them."""
     numbers = settings.model_dump() | chosen
     numbers |= {name: tuple(numbers[name]) for name in ("updates", "explore")}
@@ -94,7 +93,7 @@ def third_phase(seed: int, how: agent.PublishedTraining) -> tuple[agent.DqnState
     return train_state, key
 
 
-def searched_run(settings: TrainAgent, chosen: Mapping[str, Any], seed: int) -> SearchedRun:
+def searched_run(settings: TrainAgent, chosen: dict[str, Any], seed: int) -> SearchedRun:
     """All phases by these settings from this seed."""
     code = [made.code_digest((LOOP / name).read_text(encoding="utf-8")) for name in CODE]
     digest = joblib.hash((settings.model_dump() | chosen, seed, code, jax.__version__))
@@ -104,11 +103,11 @@ def searched_run(settings: TrainAgent, chosen: Mapping[str, Any], seed: int) -> 
     how = training(settings, chosen)
     # what phase 4 alone sees is the same for all, so that phases 1 to 3 are trained once
     shared = how._replace(rate_at_end=1.0, explore=(*how.explore[:3], 1.0))
-    train_state, key = third_phase(seed, shared)
+    train_state, key = third_phase(seed, shared)  # ty: ignore[invalid-argument-type]
     result = agent.published_phase(train_state, key, how, len(PHASES))
     best = agent.best_checkpoint(result, key, how)
     shares = []
-    for network in (best.network, result.train_state.network):
+    for network in (best.network, cast(agent.QNetwork, result.train_state.network)):
         path = agent.run_starts(network, accuracy=how.accuracy)
         told = score.judge(np.asarray(path.flow), np.asarray(path.temperature))
         shares += [told.settled.percent, told.stay.percent]

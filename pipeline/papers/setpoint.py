@@ -180,7 +180,7 @@ def rewards_of(agents: PhaseNetworks, how: agent.PublishedTraining) -> dict[str,
     return {"by_phase": phases, "updates": list(how.updates), **ends, **shape}
 
 
-def table_2(how: agent.PublishedTraining) -> dict[str, float]:
+def table_2(how: agent.PublishedTraining) -> dict[str, Any]:
     """What table 2 lists, as it was used here."""
     return {
         "gamma": how.dqn.gamma,
