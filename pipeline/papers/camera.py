@@ -52,7 +52,7 @@ def film(rng: np.random.Generator, segments: int, frames: int, first: int) -> Fi
         for degrees in nozzle_scene.TEMPERATURES:
             for percent in nozzle_scene.draw_class_flow(rng, kind, segments):
                 segment, flow = nozzle_scene.draw_segment(rng), np.full(frames, percent)
-                scene = nozzle_scene.render(segment, flow, np.full(frames, degrees), rng)
+                scene = nozzle_scene.render(segment, flow, degrees, rng)  # ty: ignore[invalid-argument-type]
                 x, y = np.add(scene.tip, rng.uniform(-SHAKEN_PX, SHAKEN_PX, 2))
                 clear, shaken = (
                     nozzle_scene.key_areas(one, least_score=0.0)

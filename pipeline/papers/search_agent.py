@@ -9,7 +9,7 @@ Validation runs alone choose checkpoint, setting and seed: the runs that an agen
 import itertools
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, cast
 
 import jax
 import joblib
@@ -28,7 +28,7 @@ SEEDS = (1, 2, 3)
 # exploration as each phase begins, episodes at once, and the share of the learning rate left at the end
 SEARCH: dict[str, tuple[Any, ...]] = {
     "explore": ([1.0, 0.3, 0.3, 0.3], [1.0, 0.3, 0.3, 1.0]),
-    "environments": (32,),
+    "environments": (8, 32),
     "rate_at_end": (1.0, 0.05),
 }
 LOOP = Path("pipeline/setpoint")
@@ -107,8 +107,8 @@ def searched_run(settings: TrainAgent, chosen: dict[str, Any], seed: int) -> Sea
     result = agent.published_phase(train_state, key, how, len(PHASES))
     best = agent.best_checkpoint(result, key, how)
     shares = []
-    for network in (best.network, result.train_state.network):
-        path = agent.run_starts(network, accuracy=how.accuracy)  # ty: ignore[invalid-argument-type]
+    for network in (best.network, cast(agent.QNetwork, result.train_state.network)):
+        path = agent.run_starts(network, accuracy=how.accuracy)
         told = score.judge(np.asarray(path.flow), np.asarray(path.temperature))
         shares += [told.settled.percent, told.stay.percent]
     updates = best.after * how.updates[-1] // agent.CHECKPOINTS
