@@ -4,7 +4,7 @@ its way, so that the next night, or a rollback, finishes what was killed in betw
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -70,19 +70,25 @@ def commit(paths: Sequence[str], message: str, parents: Sequence[str]) -> str:
         for path in paths
         if (COPY / path).exists() or any(name == path or inputs.within(name, path) for name in tracked)
     ]
-    # nothing that git ignores, or that lies behind a link to another disk
     existing = [path for path in existing if not git("check-ignore", path, check=False, place=COPY)]
-    existing = [
-        path for path in existing if not any((COPY / p).is_symlink() for p in (path, *Path(path).parents))
-    ]
+    existing = [path for path in existing if not _is_linked(COPY, path)]
     if existing:
         git("add", "-A", "--", *existing, env=env, place=COPY)
+    # a link to another disk in the copy is a file in the project, and the other way round
+    staged = names("diff", "--cached", "--name-only", "--no-renames", parents[0], env=env, place=COPY)
+    linked = [name for name in staged if _is_linked(COPY, name) or _is_linked(Path(), name)]
+    _call_with_paths("reset", "-q", parents[0], paths=linked, env=env, place=COPY)
     tree = git("write-tree", env=env, place=COPY)
     index.unlink()
     if tree == git("rev-parse", f"{parents[0]}^{{tree}}"):
         return ""
     ancestors = [word for parent in parents for word in ("-p", parent)]
     return git("commit-tree", tree, *ancestors, "-m", message, env=identity() | configure(DURABLE))
+
+
+def _is_linked(root: Path, name: str) -> bool:
+    """Whether a path is a link below `root`, or lies behind one."""
+    return any((root / path).is_symlink() for path in (name, *Path(name).parents))
 
 
 def move(references: Mapping[str, tuple[str, str]], message: str) -> None:
@@ -157,9 +163,9 @@ def _changed_stages(landing: Landing) -> list[str]:
     return [name for name, entry in after.items() if before.get(name) != entry]
 
 
-def _call_with_paths(*command: str, paths: Sequence[str]) -> None:
+def _call_with_paths(*command: str, paths: Sequence[str], **how: Any) -> None:
     if paths:
-        git(*command, "--pathspec-from-file=-", "--pathspec-file-nul", text="\0".join(paths))
+        git(*command, "--pathspec-from-file=-", "--pathspec-file-nul", text="\0".join(paths), **how)
 
 
 def set_aside(quarantined: Mapping[str, tuple[str, str, str]], lists: Mapping[str, str]) -> None:

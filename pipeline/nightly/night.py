@@ -123,7 +123,7 @@ def _work(settings: Nightly, last: Remembered, hashes: inputs.Hashes, work: Work
         yield _end_idle(work._replace(digests=digests), last)
         return
     snapshot, uncommitted = worktree.take(), inputs.uncommitted(settings)
-    worktree.make(snapshot, digests)
+    worktree.make(snapshot, [*digests, *places])
     state = champion.read()
     with contextlib.chdir(COPY):
         for name, one in state.folders.items():
