@@ -50,7 +50,7 @@ def check_head(snapshot: Snapshot, places: Sequence[str]) -> str:
     `places`, which the night is made from or writes."""
     head = git("rev-parse", "HEAD")
     for name in names("diff", "--name-only", "--no-renames", snapshot.head, head):
-        if any(name == place or inputs.within(name, place) for place in places):
+        if inputs.lies_in(name, places):
             raise ValueError(
                 f"{name} was committed while the night ran; nothing is changed, and the next night works "
                 "from it"
@@ -68,7 +68,7 @@ def commit(paths: Sequence[str], message: str, parents: Sequence[str]) -> str:
     existing = [
         path
         for path in paths
-        if (COPY / path).exists() or any(name == path or inputs.within(name, path) for name in tracked)
+        if (COPY / path).exists() or any(inputs.lies_in(name, [path]) for name in tracked)
     ]
     existing = [path for path in existing if not git("check-ignore", path, check=False, place=COPY)]
     existing = [path for path in existing if not _is_linked(COPY, path)]

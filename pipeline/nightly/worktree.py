@@ -11,6 +11,7 @@ from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from pipeline.nightly import inputs
 from pipeline.nightly.processes import (
     STATE,
     TOKEN,
@@ -156,7 +157,11 @@ def link(source: Path, target: Path, sources: Sequence[str] = ()) -> None:
     """The tree of `source` made of hard links: DVC adds nothing below a folder that is a link itself. On
     another disk a file is a link. A folder that is one stays one, unless the night reads something below it,
     `sources`: what the night moves there is then not the project's own file."""
-    if source.is_symlink() and source.is_dir() and not any(_lies_in(name, source) for name in sources):
+    if (
+        source.is_symlink()
+        and source.is_dir()
+        and not any(inputs.lies_in(name, [str(source)]) for name in sources)
+    ):
         target.symlink_to(source.resolve())
     elif source.is_dir():
         target.mkdir(parents=True, exist_ok=True)
@@ -169,10 +174,6 @@ def link(source: Path, target: Path, sources: Sequence[str] = ()) -> None:
             os.link(source.resolve(), target)
         except OSError:
             target.symlink_to(source.resolve())
-
-
-def _lies_in(name: str, folder: Path) -> bool:
-    return f"{name}/".startswith(f"{folder.as_posix()}/")
 
 
 def remove() -> None:

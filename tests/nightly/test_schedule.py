@@ -15,9 +15,9 @@ from pipeline.nightly import champion, reporting
 from tests.conftest import ROOT
 from tests.nightly.toy_nights import Project, entered
 
-STEPS = yaml.safe_load((ROOT / "schedules/github-nightly.yml").read_text(encoding="utf-8"))["jobs"]["nightly"][
-    "steps"
-]
+STEPS = yaml.safe_load((ROOT / "schedules/github-nightly.yml").read_text(encoding="utf-8"))["jobs"][
+    "nightly"
+]["steps"]
 RUN = f"""#!/bin/sh
 case $1 in
 dvc) shift; exec "{sys.executable}" -m dvc "$@";;

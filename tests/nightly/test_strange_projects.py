@@ -38,7 +38,9 @@ def quarantining(monkeypatch, name: str) -> None:
     """The night sets the recording of this name aside, and finds no drift."""
 
     def look(settings, champions, new, memory, *, night):
-        aside = {path: inputs.quarantine(path, "toy", f"{path} is broken") for path in new["toy"] if name in path}
+        aside = {
+            path: inputs.quarantine(path, "toy", f"{path} is broken") for path in new["toy"] if name in path
+        }
         drift = NightDrift({"toy": LoopDrift.none("toy")._replace(quarantined=aside)})
         return screens.Screening(drift, DriftMemory())
 
@@ -67,7 +69,7 @@ def test_recordings_behind_a_link_are_used_and_one_that_is_set_aside_is_kept(
     project.run("git", "commit", "-qm", "recordings lie elsewhere")
     quarantining(monkeypatch, "broken")
     assert "broken.csv is broken" in run(reporting.QUARANTINED)
-    assert learned() == 10.0 and champion.read().champions["toy"].run == "night-0002"
+    assert learned() == 10.0 and champion.read().champions["toy"].run == "night-0003"
     assert (inputs.QUARANTINE / "toy/broken.csv").read_text() == "50.0"
     assert Path(folder).is_symlink() and Path("datasets/raw/toy/old.csv").read_text() == "9.0\n9.0\n9.0"
     assert project.dirty() == []
@@ -163,7 +165,10 @@ def test_production_that_somebody_deleted_comes_back(project):
     assert "nothing new" in run() and project.production() == before
     shutil.rmtree("champion")
     assert "nothing new" in run() and project.production() == before
-    assert [line for line in project.dirty() if "champion" in line] == [" D champion/.gitignore", " D champion/toy.dvc"]
+    assert [line for line in project.dirty() if "champion" in line] == [
+        " D champion/.gitignore",
+        " D champion/toy.dvc",
+    ]
 
 
 def test_a_cache_without_the_list_of_a_champion_s_files_leaves_production_as_it_is(project):
@@ -171,7 +176,9 @@ def test_a_cache_without_the_list_of_a_champion_s_files_leaves_production_as_it_
     run()
     before, md5 = observe(project), champion.read().history[0].champion.md5
     Path(".dvc/cache/files/md5", md5[:2], md5[2:]).unlink()
-    with pytest.raises(ValueError, match="is not what it was in night-0001; bring DVC's cache or remote back"):
+    with pytest.raises(
+        ValueError, match="is not what it was in night-0001; bring DVC's cache or remote back"
+    ):
         by_hand.rollback("", "")
     assert observe(project) == before and not worktree.COPY.exists()
 
