@@ -464,7 +464,9 @@ def test_good_shifts_with_coarse_sensors_are_no_dead_sensors(look):
 def test_a_night_says_what_it_used_and_what_would_have_shown(look):
     shift = nights.a_night(1, 730)
     silent = np.where((np.arange(600) >= 300) & (np.arange(600) < 320), np.nan, shift["sensor_2"])
-    (shown,) = look(shift | {"sensor_2": silent}).drift.notes
+    measured = look(shift | {"sensor_2": silent}).drift
+    (shown,), (figures,) = measured.notes, measured.figures.values()
+    assert shown == f"new.csv would have shown {figures.least}"  # as the page says too
     nights.write(NEW, shift | {"sensor_2": silent})
     share = judge.measure_shares(params.load(Nightly, "nightly"), [str(NEW)])[str(NEW)]
     NEW.unlink()
