@@ -30,6 +30,7 @@ LOCK, COPY = STATE / "lock", STATE / "copy"
 LINKED = ("datasets/raw", "datasets/holdout")
 # a younger recording may still grow: it is copied as it is, and the next night finds it changed
 YOUNG_S = 600.0
+LOCKED_S = 10  # a git that works in the project is waited for so long
 
 
 class BusyError(ValueError):
@@ -72,13 +73,22 @@ def locked() -> Generator[None]:
 
 
 def take() -> Snapshot:
-    """Raises ValueError if the project is no repository of its own, a merge is half done in it, or git has
-    files below a folder that is a link by now."""
+    """Raises ValueError if the project is no repository of its own, a merge is half done in it, git has files
+    below a folder that is a link by now, or git's lock does not go."""
     head = git("rev-parse", "--verify", "-q", "HEAD", check=False)
     if not head or git("rev-parse", "--show-prefix"):
         raise ValueError(
             "expected a git repository in this folder with at least one commit, found none; run git init, "
             "and commit the project"
+        )
+    lock = Path(git("rev-parse", "--git-path", "index.lock"))
+    for _ in range(LOCKED_S):
+        if lock.exists():
+            time.sleep(1)
+    if lock.exists():
+        raise ValueError(
+            f"{lock} is there: git works in the project, or was killed there; remove the file if no git runs, "
+            "and run it again"
         )
     if unmerged := names("diff", "--name-only", "--diff-filter=U"):
         raise ValueError(f"{unmerged[0]}: a merge is half done in git; finish it, and run it again")
