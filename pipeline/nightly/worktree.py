@@ -87,8 +87,8 @@ def take() -> Snapshot:
             time.sleep(1)
     if lock.exists():
         raise ValueError(
-            f"{lock} is there: git works in the project, or was killed there; remove the file if no git runs, "
-            "and run it again"
+            f"{lock} is there: git works in the project, or was killed there; remove the file if no git "
+            "runs, and run it again"
         )
     if unmerged := names("diff", "--name-only", "--diff-filter=U"):
         raise ValueError(f"{unmerged[0]}: a merge is half done in git; finish it, and run it again")
