@@ -47,8 +47,13 @@ def get_branch() -> str:
 
 def check_head(snapshot: Snapshot, places: Sequence[str]) -> str:
     """The present commit of HEAD. Raises ValueError if one since the snapshot holds something below
-    `places`, which the night is made from or writes."""
-    head = git("rev-parse", "HEAD")
+    `places`, which the night is made from or writes, or if another branch is checked out."""
+    head, branch = git("rev-parse", "HEAD"), git("symbolic-ref", "-q", "HEAD", check=False)
+    if branch != snapshot.branch:
+        raise ValueError(
+            f"{branch or 'a detached HEAD'} was checked out while the night ran; nothing is changed, and the "
+            "next night works from what is checked out then"
+        )
     for name in names("diff", "--name-only", "--no-renames", snapshot.head, head):
         if inputs.lies_in(name, places):
             raise ValueError(

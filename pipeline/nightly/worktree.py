@@ -38,10 +38,12 @@ class BusyError(ValueError):
 
 
 class Snapshot(NamedTuple):
-    """The commit of HEAD when a night began, and one of the tracked files as they lay in the project then."""
+    """The commit of HEAD when a night began, and one of the tracked files as they lay in the project then; the
+    reference of the branch that was checked out, empty if there was none."""
 
     head: str
     files: str
+    branch: str = ""
 
 
 @contextlib.contextmanager
@@ -97,7 +99,8 @@ def take() -> Snapshot:
         raise ValueError(
             f"{links[0]} is a link, but the last commit has files below it; git add {links[0]}, and commit it"
         )
-    return Snapshot(head, git("stash", "create", env=identity()) or head)
+    branch = git("symbolic-ref", "-q", "HEAD", check=False)
+    return Snapshot(head, git("stash", "create", env=identity()) or head, branch)
 
 
 def make(snapshot: Snapshot, sources: Sequence[str]) -> None:

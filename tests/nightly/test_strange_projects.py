@@ -127,6 +127,16 @@ def test_parameters_that_the_owner_edits_meanwhile_are_those_of_the_next_night(p
     assert "nothing new" not in summary and "not committed: params.yaml" in summary
 
 
+def test_a_branch_that_the_owner_checks_out_meanwhile_gets_no_promotion(project, monkeypatch):
+    during_the_stages(monkeypatch, lambda: project.run("git", "switch", "-qc", "experiment"))
+    project.record("better", [9.0, 9.0, 9.0])
+    before = observe(project)
+    assert "refs/heads/experiment was checked out while the night ran" in run(reporting.FAILED)
+    project.run("git", "switch", "-q", "main")
+    project.run("git", "branch", "-qD", "experiment")
+    assert observe(project) == before
+
+
 def test_a_lock_of_git_that_does_not_go_ends_night_and_rollback_in_a_sentence(project, monkeypatch):
     project.record("better", [9.0, 9.0, 9.0])
     run()
