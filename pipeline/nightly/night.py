@@ -231,8 +231,9 @@ def _tell_unused(loop: NightlyLoop, recordings: Sequence[str]) -> str:
     source = params.read().get(section, {}).get(key, RECORDED)
     if source == RECORDED:
         return ""
+    are = "is" if len(recordings) == 1 else "are"
     return (
-        f"{_name_few(recordings)} {'is' if len(recordings) == 1 else 'are'} not used, for {dotted} is {source}; "
+        f"{_name_few(recordings)} {are} not used, for {dotted} is {source}; "
         f"set {dotted}: {RECORDED} in {params.home(dotted)} to learn from what is recorded"
     )
 

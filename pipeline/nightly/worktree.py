@@ -38,8 +38,8 @@ class BusyError(ValueError):
 
 
 class Snapshot(NamedTuple):
-    """The commit of HEAD when a night began, and one of the tracked files as they lay in the project then; the
-    reference of the branch that was checked out, empty if there was none."""
+    """The commit of HEAD when a night began, and one of the tracked files as they lay in the project then;
+    the reference of the branch that was checked out, empty if there was none."""
 
     head: str
     files: str
