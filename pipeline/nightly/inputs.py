@@ -6,7 +6,7 @@ import itertools
 import json
 import os
 import shutil
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 import yaml
@@ -118,16 +118,17 @@ def recordings(digests: Mapping[str, str], loop: NightlyLoop) -> dict[str, str]:
             single[name] = content
     every = single | {bag: digest(files) for bag, files in bags.items()}
     left_out = {path.as_posix() for path in excluded.exclusions(folder)} if folder else set()
-    return {
-        name: content
-        for name, content in every.items()
-        if name not in left_out and not any(within(name, other) for other in left_out)
-    }
+    return {name: content for name, content in every.items() if not lies_in(name, left_out)}
 
 
 def within(name: str, folder: str) -> bool:
     """Whether a path lies below a folder."""
     return name.startswith(f"{folder}/")
+
+
+def lies_in(name: str, places: Iterable[str]) -> bool:
+    """Whether a path is one of these, or lies below one."""
+    return any(name == place or within(name, place) for place in places)
 
 
 # ---- what cannot be learned from
@@ -191,11 +192,7 @@ def after_quarantine(
     """`digests` once these recordings are set aside: without those that were moved, and with the lists of
     those that stayed. Of what has come meanwhile nothing."""
     moved = [name for name in quarantined if not Path(name).exists()]
-    left = {
-        name: content
-        for name, content in digests.items()
-        if name not in moved and not any(within(name, bag) for bag in moved)
-    }
+    left = {name: content for name, content in digests.items() if not lies_in(name, moved)}
     lists = [Path(loop.recordings) / excluded.FILE for loop in loops.values() if loop.recordings]
     return left | {path.as_posix(): hashes.of(path) for path in lists if path.is_file()}
 
@@ -227,6 +224,6 @@ def uncommitted(settings: Nightly) -> tuple[str, ...]:
     own += recorded_places(settings) + [
         loop.recordings for loop in settings.loops.values() if loop.recordings
     ]
-    code = [name for name in sources() if not any(name == place or within(name, place) for place in own)]
+    code = [name for name in sources() if not lies_in(name, own)]
     paths = {*changed(), *(changed(*code, untracked="all") if code else ())}
-    return tuple(sorted(p for p in paths if not any(p == place or within(p, place) for place in own)))
+    return tuple(sorted(path for path in paths if not lies_in(path, own)))

@@ -4,7 +4,7 @@ its way, so that the next night, or a rollback, finishes what was killed in betw
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -47,10 +47,15 @@ def get_branch() -> str:
 
 def check_head(snapshot: Snapshot, places: Sequence[str]) -> str:
     """The present commit of HEAD. Raises ValueError if one since the snapshot holds something below
-    `places`, which the night is made from or writes."""
-    head = git("rev-parse", "HEAD")
+    `places`, which the night is made from or writes, or if another branch is checked out."""
+    head, branch = git("rev-parse", "HEAD"), git("symbolic-ref", "-q", "HEAD", check=False)
+    if branch != snapshot.branch:
+        raise ValueError(
+            f"{branch or 'a detached HEAD'} was checked out while the night ran; nothing is changed, and the "
+            "next night works from what is checked out then"
+        )
     for name in names("diff", "--name-only", "--no-renames", snapshot.head, head):
-        if any(name == place or inputs.within(name, place) for place in places):
+        if inputs.lies_in(name, places):
             raise ValueError(
                 f"{name} was committed while the night ran; nothing is changed, and the next night works "
                 "from it"
@@ -68,21 +73,27 @@ def commit(paths: Sequence[str], message: str, parents: Sequence[str]) -> str:
     existing = [
         path
         for path in paths
-        if (COPY / path).exists() or any(name == path or inputs.within(name, path) for name in tracked)
+        if (COPY / path).exists() or any(inputs.lies_in(name, [path]) for name in tracked)
     ]
-    # nothing that git ignores, or that lies behind a link to another disk
     existing = [path for path in existing if not git("check-ignore", path, check=False, place=COPY)]
-    existing = [
-        path for path in existing if not any((COPY / p).is_symlink() for p in (path, *Path(path).parents))
-    ]
+    existing = [path for path in existing if not _is_linked(COPY, path)]
     if existing:
         git("add", "-A", "--", *existing, env=env, place=COPY)
+    # a link to another disk in the copy is a file in the project, and the other way round
+    staged = names("diff", "--cached", "--name-only", "--no-renames", parents[0], env=env, place=COPY)
+    linked = [name for name in staged if _is_linked(COPY, name) or _is_linked(Path(), name)]
+    _call_with_paths("reset", "-q", parents[0], paths=linked, env=env, place=COPY)
     tree = git("write-tree", env=env, place=COPY)
     index.unlink()
     if tree == git("rev-parse", f"{parents[0]}^{{tree}}"):
         return ""
     ancestors = [word for parent in parents for word in ("-p", parent)]
     return git("commit-tree", tree, *ancestors, "-m", message, env=identity() | configure(DURABLE))
+
+
+def _is_linked(root: Path, name: str) -> bool:
+    """Whether a path is a link below `root`, or lies behind one."""
+    return any((root / path).is_symlink() for path in (name, *Path(name).parents))
 
 
 def move(references: Mapping[str, tuple[str, str]], message: str) -> None:
@@ -157,9 +168,9 @@ def _changed_stages(landing: Landing) -> list[str]:
     return [name for name, entry in after.items() if before.get(name) != entry]
 
 
-def _call_with_paths(*command: str, paths: Sequence[str]) -> None:
+def _call_with_paths(*command: str, paths: Sequence[str], **how: Any) -> None:
     if paths:
-        git(*command, "--pathspec-from-file=-", "--pathspec-file-nul", text="\0".join(paths))
+        git(*command, "--pathspec-from-file=-", "--pathspec-file-nul", text="\0".join(paths), **how)
 
 
 def set_aside(quarantined: Mapping[str, tuple[str, str, str]], lists: Mapping[str, str]) -> None:

@@ -7,6 +7,7 @@ must never be silenced as a badly written record. If the machine would have had 
 likeliest mistake is named all the same.
 """
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -115,14 +116,12 @@ def _best(
 
 
 def _swaps(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo]]:
-    for i in range(len(outputs)):
-        for j in range(i):
-            words = f"the sensors {outputs[j]} and {outputs[i]} are swapped"
-            yield words, lambda u, y, at=(i, j): (u, _swapped(y, at))
-    for i in range(len(inputs)):
-        for j in range(i):
-            words = f"the inputs {inputs[j]} and {inputs[i]} are swapped"
-            yield words, lambda u, y, at=(i, j): (_swapped(u, at), y)
+    for j, i in itertools.combinations(range(len(outputs)), 2):
+        words = f"the sensors {outputs[j]} and {outputs[i]} are swapped"
+        yield words, lambda u, y, at=(i, j): (u, _swapped(y, at))
+    for j, i in itertools.combinations(range(len(inputs)), 2):
+        words = f"the inputs {inputs[j]} and {inputs[i]} are swapped"
+        yield words, lambda u, y, at=(i, j): (_swapped(u, at), y)
 
 
 def _swapped(values: np.ndarray, at: tuple[int, int]) -> np.ndarray:

@@ -123,7 +123,7 @@ def _work(settings: Nightly, last: Remembered, hashes: inputs.Hashes, work: Work
         yield _end_idle(work._replace(digests=digests), last)
         return
     snapshot, uncommitted = worktree.take(), inputs.uncommitted(settings)
-    worktree.make(snapshot, digests)
+    worktree.make(snapshot, [*digests, *places])
     state = champion.read()
     with contextlib.chdir(COPY):
         for name, one in state.folders.items():
@@ -231,9 +231,9 @@ def _tell_unused(loop: NightlyLoop, recordings: Sequence[str]) -> str:
     source = params.read().get(section, {}).get(key, RECORDED)
     if source == RECORDED:
         return ""
-    first, more = ", ".join(recordings[:3]), f" and {len(recordings) - 3} more" if len(recordings) > 3 else ""
+    are = "is" if len(recordings) == 1 else "are"
     return (
-        f"{first}{more} {'is' if len(recordings) == 1 else 'are'} not used, for {dotted} is {source}; "
+        f"{_name_few(recordings)} {are} not used, for {dotted} is {source}; "
         f"set {dotted}: {RECORDED} in {params.home(dotted)} to learn from what is recorded"
     )
 
@@ -326,8 +326,12 @@ def _tell_uncommitted(paths: Sequence[str]) -> list[str]:
     """That the night's result cannot be made again from its commit, if sources lie there uncommitted."""
     if not paths:
         return []
-    more = f" and {len(paths) - 3} more" if len(paths) > 3 else ""
-    return [f"not committed: {', '.join(paths[:3])}{more}; no commit alone makes this night's result again"]
+    return [f"not committed: {_name_few(paths)}; no commit alone makes this night's result again"]
+
+
+def _name_few(paths: Sequence[str]) -> str:
+    """ "a, b, c and 2 more"."""
+    return ", ".join(paths[:3]) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
 
 
 # ---- the commit, which is the promotion

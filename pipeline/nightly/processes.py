@@ -61,13 +61,9 @@ def _output(
 def changed(*places: str, untracked: str = "no") -> list[str]:
     """Paths below `places` (none: everywhere) that differ from the last commit; both names of one that was
     renamed. `untracked` is git's word: no, normal or all."""
-    entries = iter(names("status", "--porcelain", f"--untracked-files={untracked}", "--", *places))
-    paths = []
-    for entry in entries:
-        paths.append(entry[3:])  # two letters and a blank, either letter a blank too
-        if "R" in entry[:2] or "C" in entry[:2]:
-            paths.append(next(entries))
-    return paths
+    how = ("--porcelain", "--no-renames", f"--untracked-files={untracked}")
+    # two letters and a blank, either letter a blank too
+    return [entry[3:] for entry in names("status", *how, "--", *places)]
 
 
 def configure(settings: Mapping[str, str]) -> dict[str, str]:

@@ -4,7 +4,6 @@ which nothing runs; one that passes goes in production where it is better than t
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -34,11 +33,8 @@ CERTIFICATE = f"{EXPORTED}/certificate.json"
 CERTIFIED = (f"{EXPORTED}/controller.json", f"{EXPORTED}/arrays.safetensors", CERTIFICATE)
 
 
-class JudgedLoop(NamedTuple):
-    """What was decided of a loop's challenger, and what it measured; None where it was not measured."""
-
-    decision: LoopDecision
-    metrics: ChampionMetrics | None = None
+# what was decided of a loop's challenger, and what it measured; None where it was not measured
+JudgedLoop = tuple[LoopDecision, ChampionMetrics | None]
 
 
 def judge_all(
@@ -61,7 +57,7 @@ def judge_all(
         decision = decision._replace(verdict=verdict and verdict._replace(rules=()))
         decisions[name] = decision
         if decision.promotes or decision.decision == CANDIDATE:
-            state = _place(settings, name, night, state, JudgedLoop(decision, metrics), made_from)
+            state = _place(settings, name, night, state, (decision, metrics), made_from)
         if (
             name in state.candidates
             and decision.decision != CANDIDATE
@@ -125,7 +121,7 @@ def judge_loop(
         alarms=night.drift.of(name).alarms,
         seed=night.number,
     )
-    return JudgedLoop(decision, _metrics(challenger))
+    return decision, _metrics(challenger)
 
 
 def list_files(loop: NightlyLoop) -> list[str]:
@@ -144,7 +140,7 @@ def _declared(settings: Nightly, loop: str) -> str:
 
 
 def _keep(reason: str) -> JudgedLoop:
-    return JudgedLoop(LoopDecision(KEPT, [reason]))
+    return LoopDecision(KEPT, [reason]), None
 
 
 def _metrics(evidence: judge.CaseCosts) -> ChampionMetrics:
@@ -188,13 +184,13 @@ def _candidate(
     measures all the same."""
     decision = LoopDecision(CANDIDATE, [why])
     if before and before.contestant == verdict.subject and champion.same(before.files, files):
-        return JudgedLoop(decision, before.metrics)
+        return decision, before.metrics
     try:
         evidence = judging.measure(Path("datasets"), verdict.subject)
     except ValueError as reason:
-        return JudgedLoop(decision._replace(reasons=[why, f"not measured: {reason}"]))
+        return decision._replace(reasons=[why, f"not measured: {reason}"]), None
     guards = {name: records.Guard(None, figure, None) for name, figure in evidence.guards.items()}
-    return JudgedLoop(decision._replace(guards=guards), _metrics(evidence))
+    return decision._replace(guards=guards), _metrics(evidence)
 
 
 # ---- what lies in champion/

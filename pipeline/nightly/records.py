@@ -353,13 +353,6 @@ class DriftMemory(NamedTuple):
     night: int = 0
     recent: Mapping[str, Mapping[str, Any]] = {}
 
-    @classmethod
-    def read(cls, fields: Mapping[str, Any]) -> "DriftMemory":
-        return from_json(cls, fields)
-
-    def to_json(self) -> dict[str, Any]:
-        return to_json(self)
-
 
 class Remembered(NamedTuple):
     """The last night: its number, time of the last success (empty before the first), and the digest of all

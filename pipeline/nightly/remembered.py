@@ -6,10 +6,9 @@ import json
 from typing import Any
 
 from pipeline.nightly.processes import STATE, git
-from pipeline.nightly.records import DriftMemory, Night, Remembered, from_json, to_json
+from pipeline.nightly.records import Night, Remembered, from_json, to_json
 from pipeline.store import artifacts
 
-__all__ = ["DriftMemory", "Remembered"]
 LAST, NIGHTS, METRICS = STATE / "last.json", STATE / "nights.json", "reports/metrics/nightly.json"
 LONGEST_HISTORY = 1000
 

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.nightly import champion, pictures, temperature_drift
-from pipeline.nightly.records import SENSOR, LoopDrift, NightDrift
-from pipeline.nightly.remembered import DriftMemory
+from pipeline.nightly.records import SENSOR, DriftMemory, LoopDrift, NightDrift
 from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.nightly.temperature_drift import REFERENCE
 from pipeline.store import artifacts, params

@@ -348,7 +348,7 @@ def _one(
             found=[one._replace(words=f"{one.words}; or {doubt.words}") for one in measured.found]
         )
     drifted.figures[path] = measured.figures
-    drifted.notes.append(f"{Path(path).name} would have shown {measured.least}")
+    drifted.notes.append(f"{Path(path).name} would have shown {measured.figures.least}")
     nights.append(NightChanges({found.key: found.estimate for found in measured.found}, measured.seeming))
     del nights[:-POOLED]
     singly = [
@@ -435,15 +435,13 @@ def _worth(estimate: Estimate) -> float:
 
 class RecordingDrift(NamedTuple):
     """Of one recording: figures for the page, what changed, what each change would be where none is named,
-    and what the closed loop does otherwise beyond what those changes and the air around bring. `least` says
-    which changes would have shown; `misfit` is the mean squared error that is left, in that of the champion's
-    own."""
+    and what the closed loop does otherwise beyond what those changes and the air around bring. `misfit` is
+    the mean squared error that is left, in that of the champion's own."""
 
     figures: RecordingFigures
     found: list[RecordingChange]
     seeming: dict[str, Estimate]
     loop: list[CameraChange]
-    least: str
     misfit: float
 
 
@@ -501,13 +499,13 @@ def _measure(
         found.append(_air(limits, air, record, held))
     effect = drift.moved(record, own.changes, explained.changes) + abs(air)
     loop = _loop(limits, closed_loop, held, names, effect, asked=not found)
-    figures = RecordingFigures(
-        _parameters(record, explained, held, names), noise, loop.figures, loop.not_applicable
-    )
-    seeming, least = _seeming(record, explained, held, names), _least(limits, explained, held, names)
+    parameters = _parameters(record, explained, held, names)
+    least = _least(limits, explained, held, names)
+    figures = RecordingFigures(parameters, noise, loop.figures, loop.not_applicable, least)
+    seeming = _seeming(record, explained, held, names)
     samples = sum(int(one.measured.sum()) for one in record.segments)
     misfit = float(explained.left @ explained.left) / max(samples, 1)
-    return RecordingDrift(figures, [*found, *louder], seeming, loop.causes, least, misfit)
+    return RecordingDrift(figures, [*found, *louder], seeming, loop.causes, misfit)
 
 
 def _seeming(

@@ -2,8 +2,6 @@
 controllers that are in production."""
 
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
 from pipeline.nightly import judge
 from pipeline.nightly.processes import dvc
@@ -28,7 +26,8 @@ def read_verdicts(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], 
     if not loops:
         return {}, night
     evidence = read_evidence(STORED)
-    stored, tonight, named = verdict.read(STORED), _read_json(METRICS), settings.holdout.controller
+    stored, named = verdict.read(STORED), settings.holdout.controller
+    tonight = artifacts.read_json(METRICS) if artifacts.exists(METRICS) else None
     by_loop = verdict_night.verdicts(evidence, stored, tonight)
     night = _make_pages_agree(by_loop, night)
     if named != judge.PAGE:
@@ -39,10 +38,6 @@ def read_verdicts(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], 
             "run ./run dvc repro verdict, or switch the loop off in section loops"
         )
     return {name: by_loop[name] for name in loops}, night
-
-
-def _read_json(path: str | Path) -> Any:
-    return artifacts.read_json(path) if artifacts.exists(path) else None
 
 
 def _make_pages_agree(pages: Mapping[str, Verdict], night: Night) -> Night:

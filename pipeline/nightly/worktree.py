@@ -7,10 +7,11 @@ import fcntl
 import os
 import shutil
 import time
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from pipeline.nightly import inputs
 from pipeline.nightly.processes import (
     STATE,
     TOKEN,
@@ -29,6 +30,7 @@ LOCK, COPY = STATE / "lock", STATE / "copy"
 LINKED = ("datasets/raw", "datasets/holdout")
 # a younger recording may still grow: it is copied as it is, and the next night finds it changed
 YOUNG_S = 600.0
+LOCKED_S = 10  # a git that works in the project is waited for so long
 
 
 class BusyError(ValueError):
@@ -36,20 +38,22 @@ class BusyError(ValueError):
 
 
 class Snapshot(NamedTuple):
-    """The commit of HEAD when a night began, and one of the tracked files as they lay in the project then."""
+    """The commit of HEAD when a night began, and one of the tracked files as they lay in the project then;
+    the reference of the branch that was checked out, empty if there was none."""
 
     head: str
     files: str
+    branch: str = ""
 
 
 @contextlib.contextmanager
 def locked() -> Generator[None]:
     """The night's lock; the kernel lets go if a process dies. Raises BusyError if another night has it."""
-    if STATE.exists() and not STATE.is_dir():
-        raise ValueError(
-            f"{STATE}: expected the folder in which nights are remembered, found a file; "
-            "move it away, and run it again"
-        )
+    for folder, purpose in ((STATE, "in which nights are remembered"), (COPY, "in which a night works")):
+        if folder.exists() and not folder.is_dir():
+            raise ValueError(
+                f"{folder}: expected the folder {purpose}, found a file; move it away, and run it again"
+            )
     STATE.mkdir(exist_ok=True)
     if not (STATE / ".gitignore").exists():
         artifacts.write_text(STATE / ".gitignore", "*\n")
@@ -71,28 +75,44 @@ def locked() -> Generator[None]:
 
 
 def take() -> Snapshot:
-    """Raises ValueError if the project is no repository of its own, or a merge is half done in it."""
+    """Raises ValueError if the project is no repository of its own, a merge is half done in it, git has files
+    below a folder that is a link by now, or git's lock does not go."""
     head = git("rev-parse", "--verify", "-q", "HEAD", check=False)
     if not head or git("rev-parse", "--show-prefix"):
         raise ValueError(
             "expected a git repository in this folder with at least one commit, found none; run git init, "
             "and commit the project"
         )
+    lock = Path(git("rev-parse", "--git-path", "index.lock"))
+    for _ in range(LOCKED_S):
+        if lock.exists():
+            time.sleep(1)
+    if lock.exists():
+        raise ValueError(
+            f"{lock} is there: git works in the project, or was killed there; remove the file if no git "
+            "runs, and run it again"
+        )
     if unmerged := names("diff", "--name-only", "--diff-filter=U"):
         raise ValueError(f"{unmerged[0]}: a merge is half done in git; finish it, and run it again")
-    return Snapshot(head, git("stash", "create", env=identity()) or head)
+    folders = {folder for name in names("ls-files", "--", *LINKED) for folder in Path(name).parents}
+    if links := sorted(str(folder) for folder in folders if folder.is_symlink()):
+        raise ValueError(
+            f"{links[0]} is a link, but the last commit has files below it; git add {links[0]}, and commit it"
+        )
+    branch = git("symbolic-ref", "-q", "HEAD", check=False)
+    return Snapshot(head, git("stash", "create", env=identity()) or head, branch)
 
 
-def make(snapshot: Snapshot, sources: Iterable[str]) -> None:
+def make(snapshot: Snapshot, sources: Sequence[str]) -> None:
     """The copy with all that a night needs: the files that git has or does not have yet, `sources` among
-    them; recordings; memos; the outs of the stages."""
+    them, the files and folders that it reads; recordings; memos; the outs of the stages."""
     make_bare(snapshot)
     for place in LINKED:
         if (COPY / place).is_symlink():
             (COPY / place).unlink()
         shutil.rmtree(COPY / place, ignore_errors=True)
         if Path(place).exists():
-            link(Path(place), COPY / place)
+            link(Path(place), COPY / place, sources)
     for name in (*names("ls-files", "--others", "--exclude-standard"), *sources):
         if Path(name).is_file() and not (COPY / name).exists():
             (COPY / name).parent.mkdir(parents=True, exist_ok=True)
@@ -146,26 +166,33 @@ def _share_dvc() -> None:
     os.utime(btime, (0, 0))
 
 
-def link(source: Path, target: Path) -> None:
+def link(source: Path, target: Path, sources: Sequence[str] = ()) -> None:
     """The tree of `source` made of hard links: DVC adds nothing below a folder that is a link itself. On
-    another disk a file is a link; a folder that is one stays one."""
-    if source.is_dir() and source.is_symlink():
+    another disk a file is a link. A folder that is one stays one, unless the night reads something below it,
+    `sources`: what the night moves there is then not the project's own file."""
+    if (
+        source.is_symlink()
+        and source.is_dir()
+        and not any(inputs.lies_in(name, [str(source)]) for name in sources)
+    ):
         target.symlink_to(source.resolve())
     elif source.is_dir():
         target.mkdir(parents=True, exist_ok=True)
         for entry in source.iterdir():
-            link(entry, target / entry.name)
-    elif 0 <= time.time() - source.stat().st_mtime < YOUNG_S:
+            link(entry, target / entry.name, sources)
+    elif source.is_file() and 0 <= time.time() - source.stat().st_mtime < YOUNG_S:
         shutil.copy2(source, target)
-    else:
+    elif source.is_file():
         try:
-            os.link(source, target)
+            os.link(source.resolve(), target)
         except OSError:
             target.symlink_to(source.resolve())
 
 
 def remove() -> None:
     """Nothing is left of the copy."""
+    if COPY.is_symlink():
+        COPY.unlink()
     shutil.rmtree(COPY, ignore_errors=True)
     git("worktree", "prune", check=False)
 

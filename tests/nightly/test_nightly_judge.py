@@ -109,7 +109,7 @@ def test_a_champion_that_cannot_be_designed_is_named_and_stays(project, name, we
     present = Champion("night-0001", "", "", {"md5": "0"})
     state = ChampionState({"temperature": present})
     quiet = Night(2, "night-0002", "2030-01-01T02:00:00+00:00")
-    decided = promoting.judge_loop(settings, "temperature", quiet, state, None).decision
+    decided, _ = promoting.judge_loop(settings, "temperature", quiet, state, None)
     assert decided.decision == KEPT and "cannot be compared: " in decided.reasons[0]
 
 

@@ -11,8 +11,7 @@ import pytest
 import yaml
 
 from pipeline.nightly import drift, inputs, judge, screening, temperature_drift
-from pipeline.nightly.records import SENSOR, Alarm, RecordShare
-from pipeline.nightly.remembered import DriftMemory
+from pipeline.nightly.records import SENSOR, Alarm, DriftMemory, RecordShare, from_json, to_json
 from pipeline.nightly.settings import Nightly
 from pipeline.recordings import plain_files
 from pipeline.store import artifacts, params
@@ -183,7 +182,7 @@ def test_what_nights_agree_in_is_pooled_and_what_was_held_against_another_refere
     turned = [estimates[0], estimates[1], temperature_drift.Estimate(-4.3, 0.3)]
     assert temperature_drift._past_limit(turned, 4.0) == pytest.approx(1.0)
     memory = look(nights.a_night(1, 620, gain=(0.97, 1.0))).memory
-    again = DriftMemory.read(json.loads(json.dumps(memory.to_json())))
+    again = from_json(DriftMemory, json.loads(json.dumps(to_json(memory))))
     assert again == memory and "gain of heater_1" in again.recent["temperature"]["nights"][0]
     other = memory._replace(recent={"temperature": memory.recent["temperature"] | {"reference": "another"}})
     assert len(look(nights.a_night(1, 621), memory).memory.recent["temperature"]["nights"]) == 2
@@ -231,7 +230,7 @@ def test_an_offset_that_no_single_night_is_sure_of_is_found_by_the_second(look, 
 
     first = look(reads_low(630))
     assert first.drift.alarms == [] and first.memory.recent["temperature"]["nights"] == [{}]
-    second = look(reads_low(631), DriftMemory.read(json.loads(json.dumps(first.memory.to_json()))))
+    second = look(reads_low(631), from_json(DriftMemory, json.loads(json.dumps(to_json(first.memory)))))
     (alarm,) = second.drift.alarms
     assert (alarm.kind, alarm.channel) == ("offset", "sensor_2"), alarm
     # the memory of an older version knows what nights named, not what they left unnamed
@@ -259,7 +258,7 @@ def test_of_a_long_record_its_last_samples_are_asked():
 
 
 def test_a_memory_of_an_older_version_is_read():
-    assert DriftMemory.read({"pending": ["a"], "alarms": [], "drifted": {}, "night": 3}).recent == {}
+    assert from_json(DriftMemory, {"pending": ["a"], "alarms": [], "drifted": {}, "night": 3}).recent == {}
 
 
 def test_a_recording_that_is_set_aside_is_held_against_drift_all_the_same(look):
@@ -465,7 +464,9 @@ def test_good_shifts_with_coarse_sensors_are_no_dead_sensors(look):
 def test_a_night_says_what_it_used_and_what_would_have_shown(look):
     shift = nights.a_night(1, 730)
     silent = np.where((np.arange(600) >= 300) & (np.arange(600) < 320), np.nan, shift["sensor_2"])
-    (shown,) = look(shift | {"sensor_2": silent}).drift.notes
+    measured = look(shift | {"sensor_2": silent}).drift
+    (shown,), (figures,) = measured.notes, measured.figures.values()
+    assert shown == f"new.csv would have shown {figures.least}"  # as the page says too
     nights.write(NEW, shift | {"sensor_2": silent})
     share = judge.measure_shares(params.load(Nightly, "nightly"), [str(NEW)])[str(NEW)]
     NEW.unlink()

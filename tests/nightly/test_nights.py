@@ -181,6 +181,35 @@ def test_an_idle_night_is_a_success_with_a_note_and_idle_nights_are_counted(proj
     assert "no new recording" not in run()
 
 
+@pytest.mark.parametrize("file", ["params.yaml", "params.expert.yaml"])
+def test_a_change_of_either_file_of_parameters_is_something_new(project, file):
+    assert "nothing new" in run()
+    Path(file).write_text(Path(file).read_text() + "\n# another comment\n")
+    summary = run()
+    assert "nothing new" not in summary and f"not committed: {file}" in summary
+    assert "nothing new" in run()
+
+
+def test_a_recording_that_is_not_used_says_which_parameter_would_use_it(project):
+    loop = {"judge": "deposition", "cases": "", "recordings": "datasets/raw/deposition", "artifacts": ["a"]}
+    project.set(loops=SETTINGS["loops"] | {"deposition": loop})
+    sections = json.loads(Path("params.yaml").read_text())
+    sections["train_ilc"]["source"] = "simulated"
+    Path("params.yaml").write_text(json.dumps(sections))
+    Path("datasets/raw/deposition").mkdir()
+    Path("datasets/raw/deposition/trial.mcap").write_bytes(b"x")
+    sentence = (
+        "datasets/raw/deposition/trial.mcap is not used, for train_ilc.source is simulated; set "
+        "train_ilc.source: recordings in params.yaml to learn from what is recorded"
+    )
+    night.nightly(render_night)
+    assert sentence in remembered.nights()[-1].notes
+    # one that is used is not said to be unused
+    project.record("new", [9.0])
+    night.nightly(render_night)
+    assert not any("is not used" in note for note in remembered.nights()[-1].notes)
+
+
 # ---- promote, keep, roll back
 
 
