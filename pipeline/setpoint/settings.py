@@ -155,7 +155,7 @@ class Pixels(Section):
 
 class MostHarmed(Section):
     """Of runs from good starts those that may leave +-25 %, or a controller is no candidate: from 100 %, and
-    from 92.5 to 107.5 % with a camera that is right, stuck or blind for a while."""
+    from 92.5 to 107.5 %."""
 
     perfect_percent: float = Field(ge=0, le=100)
     in_band_percent: float = Field(ge=0, le=100)
