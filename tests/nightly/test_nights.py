@@ -501,6 +501,7 @@ def test_a_note_whose_commit_never_landed_is_forgotten(project, monkeypatch):
         night.nightly(render_night)
     lock = Path(".git/refs/heads/main.lock")
     lock.touch()  # as git leaves it if it is killed there
+    Path(".beadline/index.lock").touch()
     assert "the night before was killed" in run() and not lock.exists()
     assert champion.read().champions["toy"].run == "night-0002" and project.dirty() == []
 
