@@ -67,6 +67,7 @@ def commit(paths: Sequence[str], message: str, parents: Sequence[str]) -> str:
     """A commit of these paths as they lie in the copy over the tree of the first parent; empty if nothing
     differs. No reference and no index of anybody's changes."""
     index = STATE / "index"
+    Path(f"{index}.lock").unlink(missing_ok=True)  # of a git that was killed with its night
     env = {"GIT_INDEX_FILE": str(index.resolve())} | configure(DURABLE)
     git("read-tree", parents[0], env=env, place=COPY)
     tracked = names("ls-files", "--", *paths, env=env, place=COPY)

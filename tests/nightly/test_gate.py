@@ -487,7 +487,7 @@ def test_the_same_files_as_another_contestant_are_another_challenger(project):
             TONIGHT,
             ChampionState({"temperature": other()._replace(files=files, contestant=contestant)}),
             said,
-        ).decision
+        )[0]
         for contestant, said in (
             ("subspace_lqg", verdict),
             ("pi_simc", verdict),
@@ -507,7 +507,7 @@ def test_the_same_files_as_another_contestant_are_another_challenger(project):
 
 def test_a_champion_that_would_lack_what_it_is_designed_from_is_not_promoted(project):
     verdict = verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"]._replace(subject="pi_simc")
-    decided = promoting.judge_loop(settings(), "temperature", TONIGHT, ChampionState(), verdict).decision
+    decided, _ = promoting.judge_loop(settings(), "temperature", TONIGHT, ChampionState(), verdict)
     assert decided.decision == KEPT and decided.reasons == [
         "pi_simc is designed from datasets/identify_plant/spread.parquet, which the champion would lack; add "
         "it to nightly.loops.temperature.artifacts"
