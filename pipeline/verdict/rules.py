@@ -192,7 +192,7 @@ def judge(
     undecided = decides(question, figure, words) if decides and rule.state == UNDECIDED else ""
     fails = words.get("fails") or (row.fails if isinstance(row.fails, str) else row.fails[case])
     remedy = words.get("remedy") or (row.remedy if isinstance(row.remedy, str) else row.remedy[case])
-    limit = _text(question.limit, row.unit)
+    limit = words.get("limit_words") or _text(question.limit, row.unit)
     places = {"name": row.name, "value": text, **words, "limit": limit, "undecided": undecided}
     sentence = row.passes if row.passes and rule.state == PASSED else fails
     try:

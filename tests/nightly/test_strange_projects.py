@@ -12,7 +12,7 @@ from pipeline.cli import render_night
 from pipeline.nightly import by_hand, champion, inputs, night, reporting, worktree
 from pipeline.nightly import screening as screens
 from pipeline.nightly.records import DriftMemory, LoopDrift, NightDrift
-from tests.nightly.test_nights import during_the_stages, learned, run
+from tests.nightly.test_nights_in_a_copy import during_the_stages, learned, run
 from tests.nightly.toy_nights import Project, entered
 
 
