@@ -17,6 +17,7 @@ from pipeline.recordings import plain_files
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
 from pipeline.temperature.identification import model_choice as identification
+from pipeline.temperature.settings import Plant
 from tests.mcap_writing import Written
 from tests.nightly import shifts_recorded as nights
 
@@ -249,6 +250,57 @@ def test_what_restless_air_makes_a_change_seem_is_not_pooled(look):
     warmed = {name: good[name] + course for name in ("sensor_1", "sensor_2")}
     assert seems(good | warmed) == {}
     assert seems(nights.a_night(1, 641, colder_degC=4.0)) == {}
+
+
+def a_record(wanted: np.ndarray, readings: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns as `ingest` has them, of both sensors alike, with the set-points beside."""
+    record = {"time_s": np.arange(float(len(wanted))), "segment": np.zeros(len(wanted), int)}
+    for k in (1, 2):
+        columns = {f"heater_{k}": np.full(len(wanted), 40.0), f"sensor_{k}": readings}
+        record |= columns | {f"{name}_masked": np.zeros(len(wanted), bool) for name in columns}
+        record[f"sensor_{k}_set_point"] = wanted
+    return record
+
+
+def test_a_closed_loop_is_held_against_the_set_points_of_the_record(made, monkeypatch):
+    monkeypatch.chdir(made)
+    machine = params.load(Plant, "plant")
+    wanted = np.repeat([100.0, 140.0, 0.0], 300)  # the last: off
+    late = np.arange(900) % 300 < 100
+    figures = temperature_drift._closed_loop(a_record(wanted, wanted + np.where(late, -30.0, 0.7)), machine)
+    # 0.7 °C too warm at either set-point, however long it took to get there
+    np.testing.assert_allclose(figures["offset_degC"][0], [0.7, 0.7], atol=1e-9)
+    np.testing.assert_allclose(figures["set_point_degC"][0], [120.0, 120.0])
+    ramp = np.linspace(100.0, 140.0, 900)
+    assert temperature_drift._closed_loop(a_record(ramp, ramp), machine) == {}
+
+
+def test_each_night_of_the_champion_is_held_against_a_model_identified_without_it(made, monkeypatch):
+    monkeypatch.chdir(made)
+    identify, seen = identification.identify, []
+
+    def spy(u, y, **settings):
+        seen.append([float(one[0, 0]) for one in y])
+        return identify(u, y, **settings)
+
+    monkeypatch.setattr(identification, "identify", spy)
+    shifts = [nights.a_night(1, k) for k in range(6)]
+    segments = [
+        [tuple(np.column_stack([one[f"{kind}_1"], one[f"{kind}_2"]]) for kind in ("heater", "sensor"))]
+        for one in shifts
+    ]
+    models = temperature_drift._without_each(params.load(Plant, "plant"), segments)
+    # nights share models: 0 and 4, 1 and 5
+    assert len(models) == 6 and models[0] is models[4] and models[1] is models[5]
+    first = [float(one["sensor_1"][0]) for one in shifts]
+    for k, fold in enumerate((0, 1, 2, 3, 0, 1)):
+        assert first[k] not in seen[fold] and len(seen[fold]) == (4 if fold < 2 else 5)
+
+
+def test_a_cap_that_takes_next_to_nothing_is_none():
+    asked = np.r_[np.full(80, 50.0), np.full(20, 61.0)][:, None]
+    assert drift.above([(asked, asked)], 0, 60.0) == 0.0
+    assert drift.above([(asked, asked)], 0, 55.0) == 20.0
 
 
 def test_of_a_long_record_its_last_samples_are_asked():
