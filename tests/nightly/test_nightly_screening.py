@@ -380,6 +380,27 @@ def test_a_cause_that_cannot_be_is_a_wrong_record_with_its_likeliest_mistake(loo
     assert re.search(r"°F where °C is declared.*; undone, it fits \d+ times better$", reason)
 
 
+@pytest.mark.parametrize(
+    ("kind", "amount", "cannot_be"),
+    [
+        ("gain", 90.0, True),
+        ("gain", -60.0, False),
+        ("offset", -55.0, True),
+        ("offset or gain", 30.0, False),
+        ("ambient", 45.0, True),  # air of 65 °C
+        ("ambient", -55.0, True),
+        ("ambient", 30.0, False),
+        ("time constant", 150.0, False),
+    ],
+)
+def test_no_machine_changes_beyond_what_is_possible_within_a_night(kind, amount, cannot_be):
+    estimate = temperature_drift.Estimate(amount, 1.0)
+    assert (
+        temperature_drift._cannot_be(temperature_drift.RecordingChange(kind, "", "", estimate, 4.0))
+        is cannot_be
+    )
+
+
 def test_a_heater_that_is_dead_is_an_alarm_and_no_mistake_of_the_record(look):
     result = look(nights.a_night(1, 303, gain=(0.04, 1.0)))
     assert any("gain from heater_1 has changed by -9" in alarm.cause for alarm in result.drift.alarms)
