@@ -1,6 +1,7 @@
 """Part programs -> plunger commands and what will become of them: reads datasets/parts,
-datasets/segment_library and datasets/train_ilc/models.json; writes datasets/compose_parts: signals.parquet,
-tasks.parquet, lines.parquet, scores.parquet and conformance.json."""
+datasets/segment_library, datasets/train_ilc/models.json and, for a simulated machine, lessons.parquet there;
+writes datasets/compose_parts: signals.parquet, tasks.parquet, lines.parquet, scores.parquet, prints.parquet
+and conformance.json."""
 
 from __future__ import annotations
 
@@ -9,13 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 import stages
 from pipeline.deposition.settings import ComposeParts, Printer, TrainIlc
-from pipeline.deposition.tables import LIBRARY, LINES, SCORES, SIGNALS, TASKS
+from pipeline.deposition.tables import LESSONS, LIBRARY, LINES, PRINTS, SCORES, SIGNALS, TASKS
 from pipeline.store import artifacts, params
-from stages.segment_library import wait
+from stages.segment_library import SegmentLibrary, wait
 
 if TYPE_CHECKING:
     from pipeline.deposition.parts.composition import LearnedLibrary
+    from pipeline.deposition.parts.evaluation import Judging, Learning
     from pipeline.deposition.parts.part import ComposedPart
+
+# the trials of each routine that a simulated machine's parts are composed from, beside all of them
+TRIALS = (2, 4, 8, 16)
 
 # figures of control that git keeps and that runs are compared by
 METRICS = (
@@ -43,10 +48,10 @@ def main() -> None:
         table = artifacts.read_table("datasets/segment_library/library.parquet", LIBRARY)
         learned = stored.restore(table, artifacts.read_json("datasets/segment_library/learned.json"))
         models = artifacts.read_json("datasets/train_ilc/models.json")
-        folder, parts, refused = Path("datasets/parts"), [], {}
+        folder, parts, refused = Path("datasets/parts"), {}, {}
         for path in part_files.part_programs(folder):
             try:
-                parts.append(compose_part(path, learned, printer, settings))
+                parts[path] = compose_part(path, learned, printer, settings)
             except ValueError as error:
                 refused[path.stem] = str(error)
         if not parts:
@@ -63,12 +68,17 @@ def main() -> None:
         rng = np.random.default_rng(settings.seed)
         scored = [
             (part, evaluation.evaluate(learned, part.composed, part.conformance.lines, judging, rng))
-            for part in tqdm(parts, desc="compose_parts: parts", mininterval=2)
+            for part in tqdm(parts.values(), desc="compose_parts: parts", mininterval=2)
         ]
-        rows = part_report.rows(scored)
-        for name, schema in (("signals", SIGNALS), ("scores", SCORES), ("tasks", TASKS), ("lines", LINES)):
+        prints = [(part, course) for part, (_, course) in scored]
+        if judging.plants:
+            prints += learn_from_fewer(parts, learned, printer, settings, judging)
+        scored = [(part, scores) for part, (scores, _) in scored]
+        rows = part_report.rows(scored) | {"prints": part_report.print_rows(prints)}
+        schemas = {"signals": SIGNALS, "scores": SCORES, "tasks": TASKS, "lines": LINES, "prints": PRINTS}
+        for name, schema in schemas.items():
             artifacts.write_table(out / f"{name}.parquet", schema, rows[name])
-        reports = {part.name: report_with_measured(part, folder) for part in parts}
+        reports = {part.name: report_with_measured(part, folder) for part in parts.values()}
         reports |= {name: {"refused": why} for name, why in refused.items()}
         artifacts.write_json(out / "conformance.json", reports)
         artifacts.write_metrics("compose_parts", part_report.figures(scored) | {"refused": refused}, METRICS)
@@ -114,6 +124,39 @@ def compose_part(
             longest_ramp_s=printer.longest_ramp_s, shortest_s=settings.shortest_s,
             largest_error_percent=settings.largest_error_percent,
         )  # fmt: skip
+
+
+def learn_from_fewer(
+    parts: dict[Path, ComposedPart], learned: LearnedLibrary, printer: Printer, settings: ComposeParts,
+    judging: Judging,
+) -> list[tuple[ComposedPart, list[Learning]]]:  # fmt: skip
+    """Each part as the first TRIALS of every routine alone would have it composed, and as `learned` from all
+    of them has it, with the true errors."""
+    from tqdm import tqdm
+
+    from pipeline.deposition.parts import composition, evaluation, stored
+
+    law, path = params.load(SegmentLibrary, "segment_library").law, "datasets/train_ilc/lessons.parquet"
+    samples = artifacts.read_table(path, LESSONS)
+    trainings = stored.trainings(samples, law, printer.training_routines(), printer.nozzle_mm)
+    del samples
+    trials, found = max(len(one.u) for one in trainings), []
+    for count in tqdm([*(n for n in TRIALS if n < trials), trials], desc="compose_parts: from fewer trials"):
+        fewer = [one._replace(u=one.u[:count], y=one.y[:count]) for one in trainings]
+        then, composed = learned, list(parts.values())
+        if count < trials:
+            try:
+                then = composition.learn(fewer, sample_time_s=printer.sample_time_s)
+                composed = [compose_part(path, then, printer, settings) for path in parts]
+            except ValueError:
+                continue  # of so few trials nothing is learned
+        for part in composed:
+            prints = [
+                sum(len(one.u) for one in fewer if one.material == stream.material)
+                for stream in part.composed.streams
+            ]
+            found.append((part, evaluation.learned_from(then, part.composed, judging, prints)))
+    return found
 
 
 def report_with_measured(part: ComposedPart, folder: Path) -> dict[str, Any]:

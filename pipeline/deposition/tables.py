@@ -149,6 +149,25 @@ SCORES = Schema(
         ),
     ),
 )
+PRINTS = Schema(
+    "prints",
+    1,
+    (
+        Column("part", TEXT, NONE, "part program"),
+        Column("material", TEXT, NONE, "material"),
+        Column("composer", TEXT, NONE, "name in the table of controllers; ilc: full-part ILC"),
+        Column(
+            "prints", COUNT, NONE, "prints that it had learned from: of training routines, or of the part"
+        ),
+        Column(
+            "rms_percent_of_on_off",
+            FLOAT,
+            "percent",
+            "root mean square error of the true flow, as share of on-off control's",
+            low=0,
+        ),
+    ),
+)
 TASKS = Schema(
     "tasks",
     1,

@@ -422,6 +422,10 @@ def main() -> None:
         "settings": settings(),
         "enough": enough(u, y),
     }
+    result["comparable"] = {
+        weights: result["data_driven"][weights]["error"] / result["model_based"][weights]["error"]
+        for weights in ("identity", "tuned")
+    }
     files.write("temperature", result)
 
 

@@ -4,10 +4,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 
+from pipeline import statistics
 from pipeline.deposition.controllers import COMPOSERS as TABLE
-from pipeline.verdict.digits import THIN, count, number, percent, short
+from pipeline.verdict.digits import THIN, band, count, number, percent, short
 from pipeline.verdict.evidence import Evidence, Figures, lookup, need
 from pipeline.verdict.rules import Reading, Row, at_path, judge, rows
 from pipeline.verdict.settings import ReportRules
@@ -17,6 +19,7 @@ from pipeline.verdict.verdict import (
     PASSED,
     UNJUDGED,
     Missing,
+    PairSentence,
     Rule,
     Verdict,
     Words,
@@ -29,6 +32,8 @@ from pipeline.verdict.verdict import (
 LOOP = "deposition"
 # errors closer than this, in points of on-off control's, are one: the simpler composer is taken
 SAME = 0.5
+# learning a part itself is as good as a composer if its error is at most this many times as large
+AS_GOOD = 1.1
 # the simplest first; what learned the very part is a reference, and no composer of another
 COMPOSERS = tuple(row.name for row in TABLE if row.kind != "reference")
 REFERENCE = next(row.name for row in TABLE if row.kind == "reference")
@@ -36,6 +41,8 @@ BASELINE = next(row.name for row in TABLE if row.kind == "baseline")
 OURS, LIBRARY = (
     next(row.name for row in TABLE if row.kind == kind) for kind in ("model-based", "data-driven")
 )
+# the rules by which the library puts its signals together; the better one answers for data-driven composers
+RULES_OF_LIBRARY = tuple(row.name for row in TABLE if row.kind == "data-driven")
 NAMES = {row.name: row.heading for row in TABLE}
 KIND = {row.name: row.kind for row in TABLE}
 NOT_JUDGED = "not judged"
@@ -49,7 +56,7 @@ USE = {
     "basis": "the basis functions",
 }
 # what is made from the trials of the deposition loop
-COMPOSED = ("library", "learned", "signals", "scores", "tasks", "lines", "conformance")
+COMPOSED = ("library", "learned", "signals", "scores", "prints", "tasks", "lines", "conformance")
 # what to do if no trial is recorded yet
 FIRST_TRIALS = (
     "Play the commands of datasets/train_ilc/next, put their recordings into datasets/raw/deposition, and "
@@ -208,10 +215,100 @@ def worst(parts: Sequence[Structure], composer: str) -> tuple[float, Structure] 
     return _largest(parts, lambda part: part.error(composer))
 
 
+def data_driven(parts: Sequence[Structure]) -> str:
+    """The rule of the library with the smaller worst error; the paper's if both are equal."""
+    errors = {name: pair[0] for name in RULES_OF_LIBRARY if (pair := worst(parts, name))}
+    return min(errors, key=lambda name: errors[name], default=LIBRARY)
+
+
 def winner(parts: Sequence[Structure]) -> str:
     """The composer with the least worst error; among those as good, the simplest."""
     errors = {name: pair[0] for name in COMPOSERS if (pair := worst(parts, name))}
     return next((name for name, error in errors.items() if error <= min(errors.values()) + SAME), "")
+
+
+# ---- model-based against data-driven
+
+
+def pair_sentence(evidence: Evidence) -> PairSentence:
+    """ "the basis functions leave 0.25 of the flow error that the library by superposition leaves", on the
+    same streams, from how many prints on, and after how many prints of a part itself learning it is as good;
+    or that more parts are needed to tell."""
+    head, parts = "Model-based against data-driven:", structures(evidence)
+    if isinstance(parts, Missing):
+        return PairSentence(f"{head} not measured.", None)
+    if evidence.recorded("train_ilc"):
+        return PairSentence(
+            f"{head} forecasts cannot tell, as they come from the chain that the basis functions invert; "
+            "print a part by both and measure it.",
+            None,
+        )
+    other = data_driven(parts)
+    ratios = np.array([
+        part.scores[OURS].error / max(part.scores[other].error, 1e-9)
+        for part in parts
+        if {OURS, other} <= part.scores.keys()
+    ])  # fmt: skip
+    if len(ratios) < 2:
+        return PairSentence(f"{head} undecided; compose more parts (datasets/parts).", None)
+    logs = np.log(np.maximum(ratios, 1e-9))
+    log = statistics.mean_of_pools(logs, level=0.9)
+    better, worse, sign = (OURS, other, 1) if log.value <= 0 else (other, OURS, -1)
+    ratio, ends = math.exp(sign * log.value), sorted(math.exp(sign * end) for end in (log.low, log.high))
+    same = f"on the same {count(len(ratios), 'stream')}"
+    interval = f"90{THIN}% interval {band(*ends, 2)}"
+    if log.low <= 0 <= log.high:
+        needed = math.ceil(len(ratios) * (((log.high - log.low) / 2 / log.value) ** 2 - 1))
+        text = f"undecided between {phrase(OURS)} and {phrase(other)} {same}"
+        text += f" (ratio of their flow errors {number(ratio, 2)}, {interval})"
+        more = f"about {count(needed, 'more stream')} would tell"
+        return PairSentence(f"{head} {text}; {more}.", None, f"{head} undecided; {more}.")
+    leave = "leave" if better == OURS else "leaves"
+    text = (
+        f"{phrase(better)} {leave} {number(ratio, 2)} of the flow error that {phrase(worse)} "
+        f"{'leave' if worse == OURS else 'leaves'}, {same} ({interval})"
+    )
+    spent = evidence.tables.get("prints")
+    turns = "" if not isinstance(spent, Mapping) else _turns(pd.DataFrame(spent), better, worse)
+    short = f"{head} {phrase(better)}, {number(ratio, 2)} of the other’s error ({band(*ends, 2)})."
+    return PairSentence(f"{head} {text}.", better, short, turns)
+
+
+def _turns(spent: pd.DataFrame, better: str, worse: str) -> str:
+    """Whether the answer turns with the prints that were learned from, and after how many prints of a part
+    itself learning it is as good as the better composer."""
+    error = spent.pivot_table(
+        index=["part", "material", "prints"], columns="composer", values="rms_percent_of_on_off"
+    )
+    if not {better, worse, REFERENCE} <= set(error.columns):
+        return ""
+    both = error[[better, worse]].dropna()
+    fewer = both.groupby("prints").mean()  # the mean over the streams; all have the same counts
+    turned = fewer.index[fewer[better] > fewer[worse]]
+    first, last = int(fewer.index.min()), int(fewer.index.max())
+    text = (
+        f"The answer is the same at every number of prints tried, {first} to {last} of a material."
+        if turned.empty
+        else f"Up to {int(turned.max())} prints of a material the other is better."
+    )
+    after, streams = [], 0
+    for _, of_stream in error.groupby(["part", "material"]):
+        own = of_stream[REFERENCE].dropna().droplevel(["part", "material"])
+        end = of_stream[better].dropna()
+        if len(own) and len(end):
+            streams += 1
+            worse_prints = own.index[own > AS_GOOD * end.iloc[-1]]
+            reached = 1 if worse_prints.empty else int(worse_prints.max()) + 1
+            after += [reached] if reached <= own.index.max() else []
+    if not streams:
+        return text
+    of = f"on {len(after)} of {streams} streams, after {_range(after)} prints of it" if after else "on none"
+    return f"{text} Learning the part itself (data-driven) comes within a tenth of that {of}."
+
+
+def _range(values: Sequence[int]) -> str:
+    low, high = min(values), max(values)
+    return f"{low}" if low == high else f"{low} to {high}"
 
 
 # ---- the rules: of each a pair, that of the model-based composer and that of the library or the one in use
@@ -517,7 +614,7 @@ def _printed(case: Parts, composer: str) -> Reading:
     ]
     # the priority rule does not print a line that is shorter than the lead
     short_lines = sum(report.get("shorter_than_lead", 0) for report in conformance.values())
-    lost = len(refused) + (short_lines if KIND[composer] == "data-driven" else 0)
+    lost = len(refused) + (short_lines if composer == LIBRARY else 0)
     return count_of(lost), {
         "text": f"{lost:,} not" if lost else "all",
         "case": "refused" if refused else "short",
@@ -568,7 +665,8 @@ def verdict(evidence: Evidence) -> Verdict:
         )
     use = winner(parts)
     # pressure advance has no signals of the library, so it has rules of its own
-    beside = use if use not in (BASELINE, "") and KIND.get(use) == "baseline" else LIBRARY
+    own = use not in (BASELINE, "") and KIND.get(use) == "baseline"
+    beside = use if own else data_driven(parts)
     lines = rules(evidence, parts, beside)
     # the column of the model-based composer, also if nothing is known, or that of the one beside it
     column = 0 if use in (OURS, "") else 1
@@ -585,12 +683,8 @@ def verdict(evidence: Evidence) -> Verdict:
     ]
     state = FAILED if use == BASELINE else overall([rule.state for rule in binding])
     first = None if state == PASSED else deciding(binding) or deciding(judged)
-    reported = (
-        first is not None
-        and first.reason
-        and (use == OURS or beside != LIBRARY or "machine" in needs[first.name])
-    )
-    summary = _summary(parts, use, machine)
+    reported = first is not None and first.reason and (use == OURS or own or "machine" in needs[first.name])
+    summary = f"{_summary(parts, use, machine)} {pair_sentence(evidence).text}"
     return Verdict(
         loop=LOOP,
         state=state,
@@ -636,19 +730,11 @@ def _peak(evidence: Evidence) -> float:
 
 
 def _summary(parts: Sequence[Structure], use: str, machine: bool) -> str:
-    """The composer in use with its figure and its yardsticks: on-off control, the
-    others, and what learning each structure reaches."""
+    """The composer in use with its worst figure, in % of on-off control's, and its worst line."""
     found = worst(parts, use)
     if found is None:
         return "What the parts come to is not known."
     error, place = found
-    others = [
-        f"{_bare(name)} {percent(pair[0], 2)}"
-        for name in COMPOSERS
-        if name not in (use, BASELINE) and (pair := worst(parts, name))
-    ]
-    full = worst(parts, REFERENCE)
-    others += [f"learning each part from scratch {percent(full[0], 2)}"] if full else []
     lines = [line for part in parts if (line := part.worst_line(use)) is not None]
     volume = (
         f" Worst printed line: {percent(max(lines), 2)} off its volume, "
@@ -664,7 +750,7 @@ def _summary(parts: Sequence[Structure], use: str, machine: bool) -> str:
     return (
         f"{_bare(use)[:1].upper()}{_bare(use)[1:]} {'leave' if use == OURS else 'leaves'} at most "
         f"{percent(error, 2)} of on\u2011off control’s flow error "
-        f"({place.part}, {place.material}); {', '.join(others)}.{volume}{forecast}"
+        f"({place.part}, {place.material}).{volume}{forecast}"
     )
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from pipeline.deposition.tables import SCORES
+from pipeline.deposition.tables import PRINTS, SCORES
 from pipeline.setpoint.tables import SCOREBOARD
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant, recorded
@@ -30,6 +30,7 @@ TABLES = {
     "residuals": ("datasets/identify_plant/residuals.parquet", RESIDUALS),
     "dynamics": ("datasets/identify_plant/dynamics.parquet", DYNAMICS),
     "scores": ("datasets/compose_parts/scores.parquet", SCORES),
+    "prints": ("datasets/compose_parts/prints.parquet", PRINTS),
     "conformance": ("datasets/compose_parts/conformance.json", None),
     "scoreboard": ("datasets/evaluate_setpoint/scoreboard.parquet", SCOREBOARD),
     "choice": ("datasets/evaluate_setpoint/choice.json", None),

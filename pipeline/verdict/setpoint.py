@@ -21,6 +21,7 @@ from pipeline.verdict.verdict import (
     UNDECIDED,
     Figure,
     Missing,
+    PairSentence,
     Question,
     Rule,
     Verdict,
@@ -549,22 +550,13 @@ def named(board: Board, name: str) -> str:
     return f"the {board.kinds[name]}{'' if board.kinds[name] == BASELINE else ' controller'} “{name}”"
 
 
-class PairSentence(NamedTuple):
-    """Model-based against data-driven: the answer in words, the same in short, and who is better; None if not
-    told apart."""
-
-    text: str
-    short: str
-    winner: str | None
-
-
 def pair_sentence(choice: Any) -> PairSentence:
     """ "the Bayes filter keeps 41 points more of its runs than the paper's agent", on the same windows and
     segments; or that more segments are needed to tell."""
     head, pair = "Model-based against data-driven:", lookup(choice, "pair")
     gap = lookup(pair, "difference")
     if isinstance(gap, Missing):
-        return PairSentence(f"{head} not measured.", "", None)
+        return PairSentence(f"{head} not measured.", None)
     a, b, winner = str(pair["a"]), str(pair["b"]), pair.get("winner")
     same = f"on the same {pair['segments']:,} segments, {count(pair['cases'], 'case')}"
     if winner not in (a, b):
@@ -574,7 +566,7 @@ def pair_sentence(choice: Any) -> PairSentence:
         )
         ends = band(pair["low"], pair["high"], 1)
         text = f"undecided between {_the(a)} and {_the(b)} {same} (90{THIN}% interval {ends} points); {more}"
-        return PairSentence(f"{head} {text}.", f"{head} undecided; {more}.", None)
+        return PairSentence(f"{head} {text}.", None, f"{head} undecided; {more}.")
     other, sign = (b, 1) if winner == a else (a, -1)
     ends = band(*sorted(sign * pair[end] for end in ("low", "high")), 1)
     text = (
@@ -582,7 +574,7 @@ def pair_sentence(choice: Any) -> PairSentence:
         f"there than {_the(other)} {same} (90{THIN}% interval {ends} points)"
     )
     short = f"{head} {winner}, by {number(abs(gap), 1)} points ({ends})."
-    return PairSentence(f"{head} {text}.", short, winner)
+    return PairSentence(f"{head} {text}.", winner, short)
 
 
 def _the(name: str) -> str:

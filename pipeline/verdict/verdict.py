@@ -176,6 +176,16 @@ def words_for(*, recorded: bool, quick: bool) -> Words:
     return QUICK if quick else TRIAL if recorded else SIMULATION
 
 
+class PairSentence(NamedTuple):
+    """Model-based against data-driven: the answer in words, which is better (None if they are not told
+    apart), the answer in short, and what is said beside it."""
+
+    text: str
+    winner: str | None
+    short: str = ""
+    note: str = ""
+
+
 class Verdict(NamedTuple):
     """What is decided on one loop, and by which rule.
 

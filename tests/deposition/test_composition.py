@@ -331,7 +331,8 @@ def test_on_a_machine_whose_flow_nobody_knows_a_composer_scores_the_upper_end_of
         made, learned(PLANT), bead_area_mm2=AREA, ramp_s=RAMP, drive=UNLIMITED, shortest_s=0.4,
         largest_error_percent=20.0,
     )  # fmt: skip
-    scores = evaluation.evaluate(learned(PLANT), made, checks.lines, plain, np.random.default_rng(0))
+    scores, prints = evaluation.evaluate(learned(PLANT), made, checks.lines, plain, np.random.default_rng(0))
+    assert not prints  # no print of a real machine tells its true flow
     told = {prediction.composer: prediction for prediction in made.predictions}
     assert {score.composer for score in scores} == {"on_off", *told}
     for score in scores[1:]:
@@ -344,8 +345,29 @@ def test_on_a_machine_whose_flow_nobody_knows_a_composer_scores_the_upper_end_of
     # a forecast that may not be believed tells no volume either
     doubtful = [one._replace(judged=one.judged._replace(judged=False)) for one in made.streams]
     made = made._replace(streams=tuple(doubtful))
-    scores = evaluation.evaluate(learned(PLANT), made, checks.lines, plain, np.random.default_rng(0))
+    scores, _ = evaluation.evaluate(learned(PLANT), made, checks.lines, plain, np.random.default_rng(0))
     assert np.isnan([score.worst_line_volume_percent for score in scores]).all()
+
+
+def test_the_last_print_of_a_part_that_is_learned_itself_is_its_score_and_the_first_comes_after_on_off():
+    made, library = of_part("dashes"), learned(PLANT)
+    noise = training.Noise(0.01, 0.01, 0.01)
+    judging = evaluation.Judging({"A": NOMINAL}, {"A": PLANT}, LAWS, noise, 3, AREA, 0.4)
+    checks = conform(
+        made, library, bead_area_mm2=AREA, ramp_s=RAMP, drive=UNLIMITED, shortest_s=0.4,
+        largest_error_percent=20.0,
+    )  # fmt: skip
+    scores, prints = evaluation.evaluate(library, made, checks.lines, judging, np.random.default_rng(0))
+    assert [one.prints for one in prints] == [1, 2, 3, 4]
+    assert prints[0].rms_percent_of_on_off > prints[-1].rms_percent_of_on_off
+    by_name = {score.composer: score.rms_percent_of_on_off for score in scores}
+    assert prints[-1].rms_percent_of_on_off == pytest.approx(by_name["ilc"])
+    # what the whole library taught is what the scores say
+    then = evaluation.learned_from(library, made, judging, [8])
+    assert {one.prints for one in then} == {8}
+    assert {one.composer: one.rms_percent_of_on_off for one in then} == pytest.approx(
+        {name: error for name, error in by_name.items() if name not in ("on_off", "ilc")}
+    )
 
 
 def test_the_composer_with_the_least_upper_end_is_chosen():

@@ -7,7 +7,7 @@ import numpy as np
 import yaml
 
 from pipeline.deposition.controllers import COMPOSERS
-from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
+from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, PRINTS, SCORES, SIGNALS, TASKS, TRIALS
 from pipeline.store import artifacts, params
 from pipeline.temperature import tables
 from pipeline.temperature.settings import Plant
@@ -584,6 +584,13 @@ def _composed(time, wanted, scores):
         for name, (error, predicted, line) in scores.items()
     ]
     artifacts.write_table(folder / "scores.parquet", SCORES, _columns(SCORES, rows))
+    rows = [
+        ("square", "A", name, prints, error * (1 + 1 / prints))
+        for name, (error, _, _) in scores.items()
+        for prints in (1, 8, 24)
+        if name != "on_off"
+    ]
+    artifacts.write_table(folder / "prints.parquet", PRINTS, _columns(PRINTS, rows))
     artifacts.write_table(
         folder / "tasks.parquet", TASKS, _columns(TASKS, [("square", "Start", 0, 3, 1.0, 1.0, 8.0, 0.0, 0.0)])
     )

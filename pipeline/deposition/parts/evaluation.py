@@ -1,6 +1,7 @@
 """Every composer on one part, beside on-off control and full-part ILC; judged by the true flow of the
 machine, on a real one by the forecast."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +31,16 @@ class ComposerScore(NamedTuple):
     y: np.ndarray
 
 
+class Learning(NamedTuple):
+    """One composer on one stream after a number of prints: r.m.s. error of its true flow in % of on-off
+    control's."""
+
+    stream: int
+    composer: str
+    prints: int
+    rms_percent_of_on_off: float
+
+
 class Judging(NamedTuple):
     """What composers are judged by: the nominal and the true extruders by material, the latter empty where
     there is only a real machine; the laws' settings and the noise; the updates of full-part ILC; the bead's
@@ -50,24 +61,29 @@ def evaluate(
     lines: LineVolumes,
     judging: Judging,
     rng: np.random.Generator,
-) -> list[ComposerScore]:
-    """Scores of all composers on all streams.
+) -> tuple[list[ComposerScore], list[Learning]]:
+    """Scores of all composers on all streams; and on a simulated machine the error of full-part ILC after
+    each of its prints.
 
     On a real machine nobody knows the true flow: a composer scores the upper end of its forecast, its flow is
     the chain's, and full-part ILC is left out. The worst line of the chosen composer is the farther end of
     its interval in `lines`, for the flow of the chain that made the command is no measure of it; there is
     none if the forecast may not be believed.
     """
-    scores, Ts, drive = [], judging.laws.sample_time_s, judging.laws.drive
+    scores, course, Ts, drive = [], [], judging.laws.sample_time_s, judging.laws.drive
     ends = np.maximum(np.abs(lines.low_percent), np.abs(lines.high_percent))
     for i, stream in enumerate(composed.streams):
         nominal, plant = judging.nominals[stream.material], judging.plants.get(stream.material)
         long_enough = (lines.tool == stream.tool) & (lines.duration_s >= judging.shortest_s - 1e-9)
-        by_composer = {ON_OFF: obeyed(stream.r / nominal.gain, drive, sample_time_s=Ts)} | commands(
-            learned, composed, stream, drive=drive
-        )
+        by_composer = _commands(learned, composed, stream, judging)
         if plant:
-            by_composer[FULL_PART_ILC] = _full_part_ilc(plant, nominal, stream, judging, rng)
+            learning = _full_part_ilc(plant, nominal, stream, judging, rng)
+            by_composer[FULL_PART_ILC] = learning[-1]
+            errors = [_true_error(plant, u, stream, judging) for u in (by_composer[ON_OFF], *learning)]
+            course += [
+                Learning(i, FULL_PART_ILC, prints, 100 * error / max(errors[0], 1e-12))
+                for prints, error in enumerate(errors[1:], 1)
+            ]
         predicted = {p.composer: p for p in composed.predictions if p.tool == stream.tool}
         yardstick = np.nan
         for name, u in by_composer.items():
@@ -85,13 +101,45 @@ def evaluate(
             percent = told.high if told and not plant else 100 * error / max(yardstick, 1e-12)
             middle = told.median if told else np.nan
             scores.append(ComposerScore(i, name, name == stream.composer, percent, middle, worst, y))
-    return scores
+    return scores, course
+
+
+def learned_from(
+    learned: LearnedLibrary, composed: Composed, judging: Judging, prints: Sequence[int]
+) -> list[Learning]:
+    """The true error of every composer on every stream of a part that was composed by what fewer trials
+    taught; `prints` of each stream's material."""
+    rows = []
+    for i, (stream, count) in enumerate(zip(composed.streams, prints, strict=True)):
+        plant = judging.plants[stream.material]
+        by_composer = _commands(learned, composed, stream, judging)
+        errors = {name: _true_error(plant, u, stream, judging) for name, u in by_composer.items()}
+        yardstick = max(errors.pop(ON_OFF), 1e-12)
+        rows += [Learning(i, name, count, 100 * error / yardstick) for name, error in errors.items()]
+    return rows
+
+
+def _commands(
+    learned: LearnedLibrary, composed: Composed, stream: Stream, judging: Judging
+) -> dict[str, np.ndarray]:
+    """The command (T,) of on-off control, by the gain known beforehand, and of every composer."""
+    laws, gain = judging.laws, judging.nominals[stream.material].gain
+    on_off = obeyed(stream.r / gain, laws.drive, sample_time_s=laws.sample_time_s)
+    return {ON_OFF: on_off} | commands(learned, composed, stream, drive=laws.drive)
+
+
+def _true_error(plant: Extruder, u: np.ndarray, stream: Stream, judging: Judging) -> float:
+    """The norm of the true flow's error under the command u (T,), mm^3/s."""
+    laws = judging.laws
+    y = flow(plant, u, sample_time_s=laws.sample_time_s, drive=laws.drive)
+    return float(np.linalg.norm(y - stream.r))
 
 
 def _full_part_ilc(
     plant: Extruder, nominal: Extruder, stream: Stream, judging: Judging, rng: np.random.Generator
-) -> np.ndarray:
-    """The command after `updates` trials of the full part by the inverse of the identified model."""
+) -> list[np.ndarray]:
+    """The command after each of `updates` trials of the full part, and after the first print with on-off
+    control, by the inverse of the identified model."""
     laws = judging.laws
     t = np.arange(len(stream.r)) * laws.sample_time_s
     part = Routine(t, stream.r, np.zeros(len(t)), np.zeros(len(t)), stream.r > 0, 0.0, (0.0, 0.0), 0.0)
@@ -99,7 +147,8 @@ def _full_part_ilc(
     law = training.model_inverse(part, laws)
     u0 = stream.r / nominal.gain
     trials = ilc.learn(law, measure, u0, stream.r, trials=judging.updates, rise=laws.rise)
-    return ilc.next_step(trials, stream.r, law, rise=laws.rise).u
+    last = ilc.next_step(trials, stream.r, law, rise=laws.rise).u
+    return [*(trial.u for trial in trials[1:]), last]
 
 
 def _off(composed: Composed, tool: int, y: np.ndarray, judging: Judging) -> np.ndarray:

@@ -11,7 +11,7 @@ from pipeline.deposition.controllers import COMPOSERS
 from pipeline.deposition.parts import extrusion
 from pipeline.deposition.parts.composition import Composed, Stream
 from pipeline.deposition.parts.conformance import Conformance
-from pipeline.deposition.parts.evaluation import FULL_PART_ILC, ComposerScore
+from pipeline.deposition.parts.evaluation import FULL_PART_ILC, ComposerScore, Learning
 from pipeline.deposition.parts.extrusion import Extruded
 from pipeline.deposition.parts.part import ComposedPart, slowed_to
 from pipeline.deposition.parts.stored import finite, finite_or_none
@@ -156,6 +156,14 @@ def score_rows(part: ComposedPart, scores: Sequence[ComposerScore]) -> dict[str,
     columns = {name: [getattr(score, name) for score in scores] for name in ComposerScore._fields[1:6]}
     materials = [part.composed.streams[score.stream].material for score in scores]
     return {"part": [part.name] * len(scores), "material": materials} | columns
+
+
+def print_rows(learned: Sequence[tuple[ComposedPart, Sequence[Learning]]]) -> dict[str, list]:
+    """One row a composer of every stream of every part, after each number of prints."""
+    rows = [(part, one) for part, learning in learned for one in learning]
+    columns = {name: [getattr(one, name) for _, one in rows] for name in Learning._fields[1:]}
+    materials = [part.composed.streams[one.stream].material for part, one in rows]
+    return {"part": [part.name for part, _ in rows], "material": materials} | columns
 
 
 def task_rows(part: ComposedPart) -> dict[str, np.ndarray]:

@@ -1,13 +1,13 @@
 """The deposition loop on page one: the composer in use, the other one and on-off control; and the part on
 which the composer in use fares worst."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from markupsafe import Markup
 
 from pipeline.report.deposition.marks import KIND, MARK, real
-from pipeline.report.shared import charts, page
+from pipeline.report.deposition.parts import draw_flows
+from pipeline.report.shared import page
 from pipeline.report.shared.card import (
     Card,
     CardCell,
@@ -20,7 +20,16 @@ from pipeline.report.shared.card import (
     of_verdict,
 )
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.deposition import FIRST_TRIALS, LIBRARY, NAMES, OURS, Structure, structures, worst
+from pipeline.verdict.deposition import (
+    FIRST_TRIALS,
+    NAMES,
+    OURS,
+    Structure,
+    data_driven,
+    pair_sentence,
+    structures,
+    worst,
+)
 from pipeline.verdict.digits import THIN, band, count, decimals, number, percent
 from pipeline.verdict.evidence import Table
 from pipeline.verdict.verdict import PASSED, Missing, Verdict
@@ -28,37 +37,28 @@ from pipeline.verdict.verdict import PASSED, Missing, Verdict
 MOVES = "Plunger command to flow at the nozzle"
 # how long a stretch of a part is drawn, s
 STRETCH_S = 6.0
-STYLES = {
-    "basis": "line",
-    "priority": "line dd",
-    "superposition": "line dd dash",
-    "pressure_advance": "line bl dash",
-    "pressure_advance_lead": "line bl dash",
-    "on_off": "line bl",
-}
-
 Read = Callable[[Structure, str], float | None]
 
 
 def card(sources: Sources, verdict: Verdict) -> Card:
     """Flow error, line volume and what learning the part itself would gain, of three composers."""
-    parts, names = structures(sources.evidence), shown(verdict.winner or "")
+    parts = structures(sources.evidence)
     step = _step(sources, verdict)
     if isinstance(parts, Missing):
         return of_verdict(
             verdict, MOVES, step, entrants=[], rows=[], basis="", beside="", sources=[],
             missing=parts.sentence(),
         )  # fmt: skip
-    asked = sources.declared.rules
+    asked, names = sources.declared.rules, shown(verdict.winner or "", parts)
     known = [part for part in parts if part.known()]
     whose = "forecasts of the identified machine" if real(sources) else "true flow of simulated machines"
-    other = worst(known, names[1])
     return of_verdict(
         verdict,
         MOVES,
         step,
         entrants=[
-            Entrant(MARK[name], NAMES[name], _note(name) if i else note_of(verdict))
+            # "Library", by its better rule
+            Entrant(MARK[name], NAMES[name].split(",")[0], _note(name) if i else note_of(verdict))
             for i, name in enumerate(names)
         ],
         rows=[
@@ -68,18 +68,17 @@ def card(sources: Sources, verdict: Verdict) -> Card:
         ],
         basis=f"Worst of {count(len(known), 'stream')}, {whose}; small: range. "
         "% of on\u2011off’s error, pts: points of it.",
-        beside=""
-        if other is None
-        else f"{NAMES[names[1]]} is worst on {other[1].part}, {other[1].material}: {percent(other[0], 2)}.",
+        beside=pair_sentence(sources.evidence).short,
         sources=sources.source("scores"),
     )
 
 
-def shown(winner: str) -> list[str]:
+def shown(winner: str, parts: Sequence[Structure]) -> list[str]:
     """The composer in use, the other one of the pair, on-off control."""
+    library = data_driven(parts)
     if winner == "on_off":
-        return ["on_off", OURS, LIBRARY]
-    return [winner or OURS, LIBRARY if winner in (OURS, "") else OURS, "on_off"]
+        return ["on_off", OURS, library]
+    return [winner or OURS, library if winner in (OURS, "") else OURS, "on_off"]
 
 
 def _note(name: str) -> str:
@@ -148,7 +147,7 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
         return parts
     if isinstance(table, Missing):
         return table
-    names = shown(verdict.winner or "")
+    names = shown(verdict.winner or "", parts)
     found = worst(parts, names[0])
     rows = [] if found is None else _stretch(table, found[1], names[0])
     if found is None or not len(rows):
@@ -165,7 +164,7 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
         f"{part.part}, material {part.material}, about the largest error: wanted flow dashed. "
         f"Error in per cent of on\u2011off control’s: {listed}."
     )
-    wide, narrow = (_drawn(stretch, drawn, finding, size) for size in ((566, 212), (350, 240)))
+    wide, narrow = (draw_flows(stretch, drawn, finding, size) for size in ((566, 212), (350, 240)))
     seen = [f"{name}_mm3_per_s" for name in ("wanted", *drawn)]
     return Deciding(
         "Deposition, the part that decides",
@@ -187,26 +186,3 @@ def _stretch(table: Table, part: Structure, name: str) -> np.ndarray:
     middle = time[int(np.nanargmax(off))]
     start = min(max(middle - STRETCH_S / 2, time.min()), max(time.max() - STRETCH_S, time.min()))
     return mine[(time >= start) & (time <= start + STRETCH_S)]
-
-
-def _drawn(table: Mapping[str, np.ndarray], names: Sequence[str], alt: str, size: tuple[int, int]) -> Markup:
-    flows = {name: table[f"{name}_mm3_per_s"] for name in ("wanted", *names)}
-    finite = np.concatenate([values[np.isfinite(values)] for values in flows.values()])
-    room = 0.06 * float(np.ptp(finite)) or 1.0
-    time = table["time_s"]
-    frame = charts.Frame(
-        charts.linear(float(time[0]), float(time[-1])),
-        charts.linear(float(finite.min()) - room, float(finite.max()) + room),
-        *size, 40, 34, 22, 14,
-    )  # fmt: skip
-    layers = [charts.line(frame, time, flows["wanted"], "ref", most=120)]
-    for i, name in enumerate(names, 1):
-        y = flows[name]
-        layers.append(charts.line(frame, time, y, STYLES[name], most=120))
-        # a number where the line is furthest from the wanted flow
-        at = int(np.nanargmax(np.abs(y - flows["wanted"])))
-        layers.append(charts.label(frame, time[at], y[at], str(i), dx=5, dy=-4))
-    return charts.panel(
-        frame, layers, alt=alt, css="mb lead-picture", title="flow, mm³/s", across="time, s",
-        units=("s", "mm³/s"),
-    )  # fmt: skip

@@ -16,8 +16,16 @@ _MARKS = {
 _OF_KIND = {kind: [row.name for row in COMPOSERS if row.kind == kind] for kind in _MARKS}
 MARK = {row.name: _MARKS[row.kind][_OF_KIND[row.kind].index(row.name)] for row in COMPOSERS}
 KIND = {row.name: row.kind for row in COMPOSERS}
-# line of a chart by kind
-CSS = {row.name: {"data-driven": "dd", "baseline": "bl"}.get(row.kind, "mb") for row in COMPOSERS}
+# of composers that are drawn over one another; of the data-driven ones blue
+LINE = {
+    "basis": "line",
+    "priority": "line dd",
+    "superposition": "line dd dash",
+    "pressure_advance": "line bl dash",
+    "pressure_advance_lead": "line bl dash",
+    "on_off": "line bl",
+    "ilc": "line dash",
+}
 # what the two columns of its rules are, the mark of the second and that of the first
 HEADS = ("Model\u2011based", "Data\u2011driven", "data_driven", "model_based")
 

@@ -18,7 +18,16 @@ from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Change, Move
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.deposition import LIBRARY, NAMES, NOT_JUDGED, OURS, Score, Structure, gamma, structures
+from pipeline.verdict.deposition import (
+    NAMES,
+    NOT_JUDGED,
+    OURS,
+    Score,
+    Structure,
+    data_driven,
+    gamma,
+    structures,
+)
 from pipeline.verdict.digits import THIN, number, percent, short
 from pipeline.verdict.evidence import Table, lookup
 from pipeline.verdict.settings import ReportRules
@@ -77,7 +86,7 @@ def render(sources: Sources) -> str:
         real=real(sources),
         no_scores=parts if isinstance(parts, Missing) else None,
         answers=[
-            _answer(part, move)
+            _answer(part, move, data_driven(measured))
             for part, move in itertools.zip_longest(measured, deposition_change.moves(sources, measured))
         ],
         scoreboard=scoreboard(measured, sources.declared.rules),
@@ -92,6 +101,8 @@ def render(sources: Sources) -> str:
         columns=columns(sources),
         maps=deposition_parts.maps(sources),
         stretches=deposition_parts.stretches(sources),
+        by_prints=deposition_parts.by_prints(sources),
+        library={"rule": NAMES[data_driven(measured)], "mark": MARK[data_driven(measured)]},
         lines=deposition_parts.lines(sources),
         forecasts=deposition_parts.forecasts(sources),
         extruded=deposition_parts.extruded(sources),
@@ -160,8 +171,8 @@ def _floor(sources: Sources) -> str:
 # ---- the first screen: a row for each structure and material
 
 
-def _answer(structure: Structure, move: Move | None) -> dict[str, Any]:
-    """The basis functions beside the library on one scale, the strip's limit in its middle; the
+def _answer(structure: Structure, move: Move | None, library: str) -> dict[str, Any]:
+    """The basis functions beside the library's better rule on one scale, the strip's limit in its middle; the
     worst line's volume of the composer that was chosen."""
     scores, limit = structure.known(), structure.asked.flow_error_percent
     question = Question(0, "", structure.part, "%", limit, False, "")
@@ -171,7 +182,7 @@ def _answer(structure: Structure, move: Move | None) -> dict[str, Any]:
             css,
             Figure(*3 * (scores[name].error,)) if name in scores else Missing("not measured", "no score"),
         )
-        for name, css in ((OURS, "mb"), (LIBRARY, "dd"), ("ilc", "acc"))
+        for name, css in ((OURS, "mb"), (library, "dd"), ("ilc", "acc"))
     ]
     chosen = scores.get(structure.chosen)
     line = chosen.worst_line if chosen else None
@@ -189,7 +200,7 @@ def _answer(structure: Structure, move: Move | None) -> dict[str, Any]:
                 "bad": name in scores and scores[name].error > limit,
                 "best": name == best,
             }
-            for css, name in (("mb", OURS), ("dd", LIBRARY))
+            for css, name in (("mb", OURS), ("dd", library))
         ],
         "whole": percent(scores["ilc"].error, 2) if "ilc" in scores else "none",
         "strip": charts.strip(question, shown, (9, 25, 17)),

@@ -1,28 +1,41 @@
 """The parts of the deposition page: each one coloured by its flow error, the flow of every composer over its
 worst stretch, its lines, what limits it, and what was refused."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.deposition.marks import CSS, MARK, PAPER, real
+from pipeline.report.deposition.marks import LINE, MARK, PAPER, real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.deposition import NAMES, NOT_JUDGED, asked_of_the_drive, structures, unknown_streams
-from pipeline.verdict.digits import MINUS, THIN, count, number, percent, short, shortened
+from pipeline.verdict.deposition import (
+    BASELINE,
+    NAMES,
+    NOT_JUDGED,
+    OURS,
+    REFERENCE,
+    asked_of_the_drive,
+    data_driven,
+    pair_sentence,
+    structures,
+    unknown_streams,
+)
+from pipeline.verdict.digits import MINUS, THIN, count, number, percent, short
 from pipeline.verdict.evidence import Table
 from pipeline.verdict.verdict import Missing
 
 # parts and streams that are drawn; the others stand in the tables
 PARTS, STREAMS = 4, 8
-SHOWN = ("priority", "basis", "on_off")
 # share of the steady flow above which the nozzle prints; of it that is
 # neither too little nor too much, and that is much
 PRINTING, RIGHT, FAR = 0.2, 0.03, 0.10
 STRETCH_S, WORST, REFUSED = 4.0, 10, 20
+# ticks of an axis of prints
+TICKS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0)
 # places of a part that are drawn: of a longer one the worst of each stretch
 POINTS = 4000
 CLASSES = (
@@ -68,6 +81,12 @@ def maps(sources: Sources) -> list[Picture]:
     ]
 
 
+def _library(sources: Sources) -> str:
+    """The library's better rule, which answers for data-driven composers."""
+    found = structures(sources.evidence)
+    return data_driven([] if isinstance(found, Missing) else found)
+
+
 def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Picture:
     rows = table["part"] == part
     mine = {name: values[rows] for name, values in table.items()}
@@ -75,7 +94,7 @@ def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Pi
     steady = float(wanted.max()) or 1.0
     prints = wanted > PRINTING * steady
     shown, shares = [], []
-    for name in SHOWN:
+    for name in (_library(sources), OURS, BASELINE):
         error = (mine[f"{name}_mm3_per_s"] - wanted) / steady
         right = 100 * float(np.mean(np.abs(error[prints]) <= RIGHT)) if prints.any() else 0.0
         lack = 100 * float(np.mean(error[prints] < -RIGHT)) if prints.any() else 0.0
@@ -229,21 +248,10 @@ def stretches(sources: Sources) -> Picture:
     ]
     names = [
         name
-        for name in ("priority", "basis", "ilc", "on_off")
+        for name in (OURS, _library(sources), REFERENCE, BASELINE)
         if any(np.isfinite(stretch.flows[name]).any() for stretch in worst_of_each)
     ]
-    shown = [
-        PictureColumn(
-            NAMES[name],
-            PAPER[name],
-            MARK[name],
-            [
-                _panel(stretch, name, first=name == names[0], top=k == 0)
-                for k, stretch in enumerate(worst_of_each)
-            ],
-        )
-        for name in names
-    ]
+    shown = [PictureColumn(stretch.name, "", "", [_panel(stretch, names)]) for stretch in worst_of_each]
     worst = {name: max(stretch.off(name) for stretch in worst_of_each) for name in names}
     return Picture(
         "stretches",
@@ -253,8 +261,8 @@ def stretches(sources: Sources) -> Picture:
         "a full line’s, r.m.s.",
         shown,
         f"{'Forecast' if real(sources) else 'True'} flow in mm³/s against time in s, "
-        f"the {STRETCH_S:g} s around the largest error of the signal that was chosen; dashed: wanted. "
-        "What is larger runs along the edge.",
+        f"the {STRETCH_S:g} s around the largest error of the signal that was chosen; dashed: wanted; "
+        f"{', '.join(f'{k} {NAMES[name].lower()}' for k, name in enumerate(names, 1))}.",
         page.origin(sources.source("signals")),
     )
 
@@ -295,25 +303,101 @@ def _stretch(table: Table, part: str, material: str, chosen: str) -> Stretch:
     )
 
 
-def _panel(stretch: Stretch, name: str, *, first: bool, top: bool) -> Markup:
-    begin, end = float(stretch.t[0]), float(stretch.t[-1])
+def _panel(stretch: Stretch, names: list[str]) -> Markup:
+    off = ", ".join(
+        f"{k} {NAMES[name].lower()} {percent(stretch.off(name), 2)}{' (chosen)' * (name == stretch.chosen)}"
+        for k, name in enumerate(names, 1)
+    )
+    table = {f"{name}_mm3_per_s": stretch.flows[name] for name in names}
+    table |= {"time_s": stretch.t, "wanted_mm3_per_s": stretch.wanted}
+    alt = f"{stretch.name}: off the wanted flow, in % of a full line’s: {off}"
+    return draw_flows(table, names, alt, (566, 212))
+
+
+def draw_flows(
+    table: Mapping[str, np.ndarray], names: Sequence[str], alt: str, size: tuple[int, int]
+) -> Markup:
+    """Flow of the composers over one another, each with its number, and dashed the wanted one."""
+    flows = {name: table[f"{name}_mm3_per_s"] for name in ("wanted", *names)}
+    finite = np.concatenate([values[np.isfinite(values)] for values in flows.values()])
+    room = 0.06 * float(np.ptp(finite)) or 1.0
+    time = table["time_s"]
     frame = charts.Frame(
-        charts.linear(begin, end, ticks=4), charts.linear(0, 1.45 * stretch.steady, ticks=3), 270, 112, 26
-    )
-    off, chosen = percent(stretch.off(name), 2), ", chosen" if name == stretch.chosen else ""
-    text = f"{shortened(stretch.name, 24)}: {off} off{chosen}"
-    layers = [
-        charts.line(frame, stretch.t, stretch.wanted, "ref"),
-        charts.line(frame, stretch.t, stretch.flows[name]),
-        charts.label(frame, frame.x.high, frame.y.high, text, anchor="end", dy=6),
-    ]
-    alt = (
-        f"{NAMES[name]}, {stretch.name}: {off} of a full line’s flow off the wanted one "
-        f"between {number(begin, 1)} and {number(end, 1)} s"
-    )
+        charts.linear(float(time[0]), float(time[-1])),
+        charts.linear(float(finite.min()) - room, float(finite.max()) + room),
+        *size, 40, 34, 22, 14,
+    )  # fmt: skip
+    layers = [charts.line(frame, time, flows["wanted"], "ref", most=120)]
+    for i, name in enumerate(names, 1):
+        y = flows[name]
+        if not np.isfinite(y).any():
+            continue
+        layers.append(charts.line(frame, time, y, LINE[name], most=120))
+        # a number where the line is furthest from the wanted flow
+        at = int(np.nanargmax(np.abs(y - flows["wanted"])))
+        layers.append(charts.label(frame, time[at], y[at], str(i), dx=5, dy=-4))
     return charts.panel(
-        frame, layers, alt=alt, css=CSS[name], title="mm³/s" if first and top else "", units=("s", "mm³/s")
+        frame, layers, alt=alt, css="mb lead-picture", title="flow, mm³/s", across="time, s",
+        units=("s", "mm³/s"),
+    )  # fmt: skip
+
+
+# ---- by the prints that were learned from
+
+
+def by_prints(sources: Sources) -> Picture:
+    """Flow error of the composers over one another by the prints that each had learned from."""
+    table, title = sources.tables["prints"], "Model-based or data-driven, by prints spent"
+    if isinstance(table, Missing):
+        return placeholder("by-prints", title, table)
+    names = (OURS, _library(sources), REFERENCE, "pressure_advance_lead")
+    frame = pd.DataFrame(table)
+    drawn = [name for name in names if name in set(frame.composer)]
+    columns = [
+        PictureColumn(f"{part}, material {material}", "", "", [_spent_panel(rows, drawn, sources)])
+        for part, material in _streams(table)[:STREAMS]
+        for rows in [frame[(frame.part == part) & (frame.material == material)]]
+    ]
+    if not columns:
+        return placeholder("by-prints", title, Missing("not measured", "No simulated machine tells it"))
+    listed = ", ".join(f"{k} {NAMES[name].lower()}" for k, name in enumerate(drawn, 1))
+    return Picture(
+        "by-prints",
+        title,
+        pair_sentence(sources.evidence).note,
+        columns,
+        "Flow error in % of on\u2011off control’s against prints, both log scale; grey line: the limit. "
+        f"{listed[:1].upper()}{listed[1:]}. Prints are those of training routines of the material, and for "
+        f"“{NAMES[REFERENCE].lower()}” those of the part itself.",
+        page.origin(sources.source("prints")),
     )
+
+
+def _spent_panel(rows: pd.DataFrame, names: Sequence[str], sources: Sources) -> Markup:
+    """The composers of one stream."""
+    limit = sources.declared.rules.flow_error_percent
+    errors, most = rows.rms_percent_of_on_off.clip(lower=0.1), max(float(rows.prints.max()), 2.0)
+    frame = charts.Frame(
+        charts.Axis(1.0, most, tuple((tick, f"{tick:g}") for tick in TICKS if tick <= most), True),
+        charts.Axis(
+            float(min(errors.min() * 0.8, limit)), float(max(errors.max() * 1.3, 100.0)),
+            ((1.0, "1"), (limit, f"{limit:g}"), (30.0, "30"), (100.0, "100")), True,
+        ),
+        368, 190, 34, 34, 22, 30,
+    )  # fmt: skip
+    layers, ends = [charts.level(frame, limit, "lim")], []
+    for k, name in enumerate(names, 1):
+        mine = rows[rows.composer == name].sort_values("prints")
+        if mine.empty:
+            continue
+        x, y = mine.prints.to_numpy(float), mine.rms_percent_of_on_off.to_numpy(float)
+        layers.append(charts.line(frame, x, y, LINE[name]))
+        layers.append(charts.label(frame, x[-1], y[-1], str(k), dx=4, dy=4))
+        ends.append(f"{NAMES[name]} {percent(float(y[-1]), 2)} after {int(x[-1])}")
+    return charts.panel(
+        frame, layers, alt=f"Flow error by prints: {', '.join(ends)}", css="mb lead-picture",
+        title="% of on-off’s, log", across="prints", units=("prints", "%"),
+    )  # fmt: skip
 
 
 # ---- the lines

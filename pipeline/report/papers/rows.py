@@ -22,7 +22,6 @@ RULES = (
     "at_most",
     "at_least",
     "within",
-    "between",
     "claim",
     "shape",
     "entries",
@@ -181,9 +180,6 @@ def _verdict(one: Mapping[str, Any], ours: Any, entries: list[Entry]) -> str:
         return (HOLDS if rule == "claim" else SHAPE) if ours else FAILS
     if rule == "same":
         return HOLDS if _same(printed, ours) else FAILS
-    if rule == "between":
-        low, high = sorted(ours)
-        return SHAPE if low <= printed <= high else FAILS
     if rule in ("at_most", "at_least"):
         bound = one.get("bound", printed)
         return HOLDS if (ours <= bound if rule == "at_most" else ours >= bound) else FAILS

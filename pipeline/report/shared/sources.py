@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
+from pipeline.deposition.tables import FILMED, LESSONS, LIBRARY, LINES, PRINTS, SCORES, SIGNALS, TASKS, TRIALS
 from pipeline.setpoint.tables import (
     AGENT_CURVE,
     CLASSIFIED,
@@ -300,6 +300,7 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("learned", "segment_library", "learned.json", "learned", artifacts.read_json),
         ("signals", "compose_parts", "signals.parquet", *table(SIGNALS)),
         ("scores", "compose_parts", "scores.parquet", *table(SCORES)),
+        ("prints", "compose_parts", "prints.parquet", *table(PRINTS)),
         ("tasks", "compose_parts", "tasks.parquet", *table(TASKS)),
         ("lines", "compose_parts", "lines.parquet", *table(LINES)),
         ("conformance", "compose_parts", "conformance.json", "conformance", artifacts.read_json),
