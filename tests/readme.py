@@ -15,7 +15,6 @@ from pipeline.report.temperature.scorecard import setting
 from pipeline.store import artifacts
 from pipeline.verdict.controllers import heading, kind
 from pipeline.verdict.decide import questions
-from pipeline.verdict.pairs import pair_sentence
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.temperature import comparison, names, of_controller
 from pipeline.verdict.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
@@ -54,6 +53,7 @@ def blocks(accepted: Mapping[str, Any], papers: Path) -> dict[str, str]:
     """Each generated block, by its name."""
     return {
         "loops": _loops(accepted),
+        "answers": _answers(accepted),
         "temperature": _temperature(accepted),
         "papers": _papers(accepted, papers),
     }
@@ -92,6 +92,16 @@ def _loops(accepted: Mapping[str, Any]) -> str:
     for loop, cells in LOOPS.items():
         decision = accepted["verdicts"][loop]["decision"]
         lines.append(f"| {' | '.join(cells)} | **{decision}** {results[loop]} |")
+    return _plain("\n".join(lines))
+
+
+def _answers(accepted: Mapping[str, Any]) -> str:
+    """The question of the project, answered for each loop."""
+    said = {loop: accepted["verdicts"][loop].get("short_answer", "") for loop in LOOPS}
+    head = "Model-based against data-driven: "
+    lines = [
+        f"- **{loop.capitalize()}**: {answer.removeprefix(head)}" for loop, answer in said.items() if answer
+    ]
     return _plain("\n".join(lines))
 
 
@@ -143,8 +153,6 @@ def _temperature(accepted: Mapping[str, Any]) -> str:
     sentences = re.split(r"(?<=\.) (?=[A-Z])", verdict["reason"])
     lines = [
         " ".join([f"**{verdict['decision']}**", *(one for one in sentences if one.startswith(MARGINS))]),
-        "",
-        pair_sentence(metrics).text,
         "",
         f"Test set: {setting(comparison(metrics))}. Nine in ten cases are better than the figure shown. "
         "Lower cost is better.",

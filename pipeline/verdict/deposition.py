@@ -684,7 +684,7 @@ def verdict(evidence: Evidence) -> Verdict:
     state = FAILED if use == BASELINE else overall([rule.state for rule in binding])
     first = None if state == PASSED else deciding(binding) or deciding(judged)
     reported = first is not None and first.reason and (use == OURS or own or "machine" in needs[first.name])
-    summary = f"{_summary(parts, use, machine)} {pair_sentence(evidence).text}"
+    summary = _summary(parts, use, machine)
     return Verdict(
         loop=LOOP,
         state=state,

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from pipeline.verdict import decide, deposition, identification, setpoint
+from pipeline.verdict import decide, deposition, identification, pairs, setpoint
 from pipeline.verdict.evidence import Evidence
-from pipeline.verdict.verdict import LOOPS, Verdict
+from pipeline.verdict.verdict import LOOPS, PairSentence, Verdict
 
 # the stage that says whether a loop learns from recordings
 SOURCES = {"temperature": "generate_probing", "deposition": "train_ilc", "setpoint": "train_classifier"}
@@ -13,6 +13,14 @@ VERDICTS: dict[str, Callable[[Evidence], Verdict]] = {
     "temperature": decide.verdict,
     "deposition": deposition.verdict,
     "setpoint": setpoint.verdict,
+}
+
+
+# "model-based or data-driven?"
+ANSWERS: dict[str, Callable[[Evidence], PairSentence]] = {
+    "temperature": lambda evidence: pairs.pair_sentence(evidence.figures),
+    "deposition": deposition.pair_sentence,
+    "setpoint": lambda evidence: setpoint.pair_sentence(evidence.tables["choice"]),
 }
 
 
@@ -34,9 +42,12 @@ def temperature(evidence: Evidence, **night: Any) -> Verdict:
 
 
 def _whole(evidence: Evidence, verdict: Verdict) -> Verdict:
-    """The verdict with its subject, and whether it is one on simulated machines."""
-    subject = verdict.subject or verdict.winner or ""
-    return verdict._replace(subject=subject, rehearsal=simulated(evidence, verdict.loop))
+    """The verdict with its subject, whether it is one on simulated machines, and the loop's answer."""
+    subject, answer = verdict.subject or verdict.winner or "", ANSWERS[verdict.loop](evidence)
+    return verdict._replace(
+        subject=subject, rehearsal=simulated(evidence, verdict.loop), answer=answer.text,
+        short_answer=answer.short or answer.text,
+    )  # fmt: skip
 
 
 def simulated(evidence: Evidence, loop: str) -> bool:

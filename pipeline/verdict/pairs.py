@@ -1,21 +1,14 @@
 """Model-based against data-driven in a sentence: figures of the comparison -> words."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from pipeline.temperature.controllers.table import BY_NAME
 from pipeline.verdict.controllers import DATA_DRIVEN, INDIRECT, MODEL_BASED, in_a_sentence
 from pipeline.verdict.digits import band, number
 from pipeline.verdict.evidence import Figures, entry
 from pipeline.verdict.temperature import comparison, finite, names, refused
-
-
-class PairSentence(NamedTuple):
-    """Model-based against data-driven: the answer in words, and whether they are told apart."""
-
-    text: str
-    winner: str | None
-    note: str = ""
+from pipeline.verdict.verdict import PairSentence
 
 
 def pair_names(figures: Figures) -> tuple[str, str]:
@@ -41,7 +34,7 @@ def pair_sentence(figures: Figures) -> PairSentence:
     )
     if not isinstance(pair, Mapping) or (pair.get("winner") is None and pair.get("difference") is None):
         gap = refused(figures).get(a) or refused(figures).get(b) or "not measured"
-        return PairSentence(f"{head} {gap.rstrip('.')}.", None, instead)
+        return PairSentence(f"{head} {gap.rstrip('.')}.", None, note=instead)
     plants = entry(pair, "plants") or entry(comparison(figures), "plants")
     winner = entry(pair, "winner")
     p = entry(pair, "p")
@@ -53,13 +46,13 @@ def pair_sentence(figures: Figures) -> PairSentence:
         interval = _interval(pair, sign=1) if saved <= 90 else ""
         saves = f"the cheaper one saves {number(saved, 1)} %" if interval else ""
         text = f"no difference at the 5 % level between {better} and {worse} on the same {plants} plants"
-        return PairSentence(f"{head} {text}{_bracket(saves, interval, chance)}.", None, instead)
+        return PairSentence(f"{head} {text}{_bracket(saves, interval, chance)}.", None, note=instead)
     sign = 1 if finite(entry(pair, "difference")) >= 0 else -1
     gain = abs(finite(entry(pair, "difference")))
     amount = "far less" if not gain <= 90 else f"{number(gain, 0 if gain >= 10 else 1)} % less"
     interval = _interval(pair, sign=sign) if gain <= 90 else ""
     text = f"{better} costs {amount} than {worse} on the same {plants} plants"
-    return PairSentence(f"{head} {text}{_bracket(interval, chance)}.", str(winner), instead)
+    return PairSentence(f"{head} {text}{_bracket(interval, chance)}.", str(winner), note=instead)
 
 
 def _interval(pair: Mapping[str, Any], *, sign: int) -> str:

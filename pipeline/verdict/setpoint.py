@@ -489,7 +489,7 @@ def verdict(evidence: Evidence) -> Verdict:
         state=ended,
         decision=words.of(ended),
         lead=f"First {'failed' if failed else 'undecided'} rule: {first.name[:1].lower()}{first.name[1:]}.",
-        reason=f"{_closest(name, first)} {pair_sentence(evidence.tables['choice']).text}",
+        reason=_closest(name, first),
         remedy=_conditions(asked, claim == CLAIM),
         rule=first.name,
     )
@@ -582,11 +582,11 @@ def _the(name: str) -> str:
 
 
 def summary(evidence: Evidence, board: Board) -> str:
-    """The default's worst case, and who is better: model-based or data-driven."""
+    """The default's worst case."""
     mine, place = worst(board, board.default, "lasting")
     if place is None or isinstance(mine, Missing):
         return ""
     cell = board.cells[board.default, place]
     worth = f", worth {number(cell.n_eff['stay'], 0)} that share nothing," if "stay" in cell.n_eff else ""
     runs = f"{share_text(mine)} of {cell.runs:,} runs{worth} settle and stay"
-    return f"In its worst case ({within(place)}) {runs}. {pair_sentence(evidence.tables['choice']).text}"
+    return f"In its worst case ({within(place)}) {runs}."

@@ -193,6 +193,7 @@ class Verdict(NamedTuple):
     `rule` names the rule that decides, "" where all passed. `winner` is the controller that should run.
     `rules` has a line for each rule, and in it an entry for each controller that is shown. `subject` is the
     controller that the verdict is about, passed or not; `rehearsal`: it was judged on simulated data.
+    `answer` says which is better, model-based or data-driven, in a sentence, `short_answer` in few words.
     """
 
     loop: str
@@ -207,6 +208,8 @@ class Verdict(NamedTuple):
     rules: tuple[tuple[Rule, ...], ...] = ()
     subject: str = ""
     rehearsal: bool = False
+    answer: str = ""
+    short_answer: str = ""
 
     @property
     def word(self) -> str:
@@ -235,10 +238,15 @@ class Verdict(NamedTuple):
             winner=text["winner"] or None,
             subject=text["subject"],
             rehearsal=bool(fields.get("rehearsal")),
+            answer=text["answer"],
+            short_answer=text["short_answer"],
         )
 
 
-WRITTEN = ("state", "decision", "lead", "reason", "remedy", "rule", "winner", "subject", "rehearsal")
+WRITTEN = (
+    "state", "decision", "lead", "reason", "remedy", "rule", "winner", "subject", "rehearsal", "answer",
+    "short_answer",
+)  # fmt: skip
 
 
 # ---- the files of the stage `verdict`

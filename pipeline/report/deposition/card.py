@@ -20,16 +20,7 @@ from pipeline.report.shared.card import (
     of_verdict,
 )
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.deposition import (
-    FIRST_TRIALS,
-    NAMES,
-    OURS,
-    Structure,
-    data_driven,
-    pair_sentence,
-    structures,
-    worst,
-)
+from pipeline.verdict.deposition import FIRST_TRIALS, NAMES, OURS, Structure, data_driven, structures, worst
 from pipeline.verdict.digits import THIN, band, count, decimals, number, percent
 from pipeline.verdict.evidence import Table
 from pipeline.verdict.verdict import PASSED, Missing, Verdict
@@ -68,7 +59,7 @@ def card(sources: Sources, verdict: Verdict) -> Card:
         ],
         basis=f"Worst of {count(len(known), 'stream')}, {whose}; small: range. "
         "% of on\u2011off’s error, pts: points of it.",
-        beside=pair_sentence(sources.evidence).short,
+        beside=verdict.short_answer,
         sources=sources.source("scores"),
     )
 

@@ -16,17 +16,7 @@ from pipeline.verdict.verdict import Missing
 
 HOLDS, SHAPE, FAILS, OPEN = "holds", "holds in shape", "does not hold", "cannot be judged"
 VERDICTS = (HOLDS, SHAPE, FAILS, OPEN)
-RULES = (
-    "digits",
-    "same",
-    "at_most",
-    "at_least",
-    "within",
-    "claim",
-    "shape",
-    "entries",
-    "not_judged",
-)
+RULES = ("digits", "same", "at_most", "at_least", "within", "claim", "shape", "entries", "not_judged")
 # what arithmetic adds to a difference, as a share of it
 ROUNDING = 1e-9
 

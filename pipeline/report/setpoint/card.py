@@ -33,7 +33,6 @@ from pipeline.verdict.setpoint import (
     case_text,
     harm_of,
     lasting,
-    pair_sentence,
     role,
     share_text,
     within,
@@ -70,7 +69,7 @@ def card(sources: Sources, verdict: Verdict) -> Card:
         ],
         basis=f"Worst case of each; small: 95{THIN}% interval, by segment. Harm: good prints that leave "
         f"±{BEYOND[-1]}{THIN}%.",
-        beside=pair_sentence(sources.tables["choice"]).short,
+        beside=verdict.short_answer,
         sources=sources.source("scoreboard"),
     )
 

@@ -53,7 +53,7 @@ def card(sources: Sources, judged: Judgement, verdict: Verdict) -> Card:
         entrants=[Entrant(name, heading(name), note) for name, note in names.items()],
         rows=[_row(asked[key], judged, list(names)) for key in keys if key in asked] if told else [],
         basis=f"90{THIN}% quantile of {setting(comparison(sources.metrics))}; small: its 90{THIN}% band.",
-        beside=judged.pair.text,
+        beside=verdict.short_answer,
         sources=sources.source("evaluate_temperature"),
         missing=gap.sentence() if isinstance(gap, Missing) else "",
     )

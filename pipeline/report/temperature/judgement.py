@@ -21,9 +21,9 @@ from pipeline.verdict.decide import (
 )
 from pipeline.verdict.digits import count
 from pipeline.verdict.night import Drift, drift, in_production
-from pipeline.verdict.pairs import PairSentence, pair_names, pair_sentence
+from pipeline.verdict.pairs import pair_names, pair_sentence
 from pipeline.verdict.temperature import comparison, of_controller
-from pipeline.verdict.verdict import OPEN, Answers, Figure, Question, Verdict
+from pipeline.verdict.verdict import OPEN, Answers, Figure, PairSentence, Question, Verdict
 
 
 class Judgement(NamedTuple):
