@@ -9,6 +9,7 @@ from pipeline.report.deposition.marks import KIND, MARK, real
 from pipeline.report.deposition.parts import draw_flows
 from pipeline.report.shared import page
 from pipeline.report.shared.card import (
+    PICTURE,
     Card,
     CardCell,
     CardRow,
@@ -16,12 +17,22 @@ from pipeline.report.shared.card import (
     Deciding,
     Entrant,
     best_of,
-    note_of,
+    in_order,
     of_verdict,
 )
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.deposition import FIRST_TRIALS, NAMES, OURS, Structure, data_driven, structures, worst
-from pipeline.verdict.digits import THIN, band, count, decimals, number, percent
+from pipeline.verdict.deposition import (
+    BASELINE,
+    COMPOSERS,
+    FIRST_TRIALS,
+    NAMES,
+    OURS,
+    Structure,
+    data_driven,
+    structures,
+    worst,
+)
+from pipeline.verdict.digits import THIN, band, count, decimals, number
 from pipeline.verdict.evidence import Table
 from pipeline.verdict.verdict import PASSED, Missing, Verdict
 
@@ -37,43 +48,57 @@ def card(sources: Sources, verdict: Verdict) -> Card:
     step = _step(sources, verdict)
     if isinstance(parts, Missing):
         return of_verdict(
-            verdict, MOVES, step, entrants=[], rows=[], basis="", beside="", sources=[],
+            verdict, MOVES, step, entrants=[], rows=[], basis="", cost="", picture=parts, sources=[],
             missing=parts.sentence(),
         )  # fmt: skip
     asked, names = sources.declared.rules, shown(verdict.winner or "", parts)
     known = [part for part in parts if part.known()]
-    whose = "forecasts of the identified machine" if real(sources) else "true flow of simulated machines"
+    kinds = {name: KIND[name] for name in names}
     return of_verdict(
         verdict,
         MOVES,
         step,
         entrants=[
             # "Library", by its better rule
-            Entrant(MARK[name], NAMES[name].split(",")[0], _note(name) if i else note_of(verdict))
-            for i, name in enumerate(names)
+            Entrant(MARK[name], "Library" if KIND[name] == "data-driven" else NAMES[name], note)
+            for name, note in in_order(kinds).items()
         ],
         rows=[
             _row("Flow error", known, names, _error, asked.flow_error_percent, "≤", "%"),
             _row("Line volume", known, names, _volume, asked.line_volume_percent, "±", "%"),
             _row("Above learning it", known, names, _above, asked.above_whole_points, "≤", "pts"),
         ],
-        basis=f"Worst of {count(len(known), 'stream')}, {whose}; small: range. "
-        "% of on\u2011off’s error, pts: points of it.",
-        beside=verdict.short_answer,
+        basis=f"Worst of {count(len(known), 'stream')}; small: range",
+        cost=_cost(sources),
+        picture=deciding(sources, verdict),
         sources=sources.source("scores"),
     )
 
 
 def shown(winner: str, parts: Sequence[Structure]) -> list[str]:
-    """The composer in use, the other one of the pair, on-off control."""
-    library = data_driven(parts)
-    if winner == "on_off":
-        return ["on_off", OURS, library]
-    return [winner or OURS, library if winner in (OURS, "") else OURS, "on_off"]
+    """The best baseline beside on-off control, which is 100 % of itself, the model-based composer and the
+    data-driven one, among them the one in use."""
+    errors = {
+        name: pair[0]
+        for name in COMPOSERS
+        if KIND[name] == "baseline" and name != BASELINE and (pair := worst(parts, name))
+    }
+    best = min(errors, key=lambda name: errors[name], default=BASELINE)
+    of_kind = {"baseline": best, "model-based": OURS, "data-driven": data_driven(parts)}
+    return list((of_kind | ({KIND[winner]: winner} if winner in KIND else {})).values())
 
 
-def _note(name: str) -> str:
-    return "yardstick" if KIND[name] == "baseline" else KIND[name]
+def _cost(sources: Sources) -> str:
+    """Prints that were learned from."""
+    table = sources.tables["trials"]
+    if isinstance(table, Missing) or not len(table["trial"]):
+        return ""
+    law = "model_inverse" if (table["law"] == "model_inverse").any() else "pixels"
+    mine = table["law"] == law
+    # the reference routine judges, unless there is no other
+    mine &= (table["routine"] > 0) | ~(table["routine"][mine] > 0).any()
+    materials = len(set(table["material"][mine].tolist()))
+    return f"{int(mine.sum())} prints of training routines, {count(materials, 'material')}"
 
 
 # ---- the figures
@@ -146,22 +171,14 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     part = found[1]
     stretch = {key: table[key][rows] for key in table}
     drawn = [name for name in names if np.isfinite(stretch.get(f"{name}_mm3_per_s", np.nan)).any()]
-    listed = ", ".join(
-        f"{i} {NAMES[name].lower()} {percent(part.scores[name].error, 2)}"
-        for i, name in enumerate(drawn, 1)
-        if name in part.scores
-    )
+    listed = ", ".join(f"{i} {NAMES[name].lower()}" for i, name in enumerate(drawn, 1) if name in part.scores)
     finding = (
-        f"{part.part}, material {part.material}, about the largest error: wanted flow dashed. "
-        f"Error in per cent of on\u2011off control’s: {listed}."
+        f"{part.part}, material {part.material}, about the largest error; dashed: wanted flow. {listed}."
     )
-    wide, narrow = (draw_flows(stretch, drawn, finding, size) for size in ((566, 212), (350, 240)))
     seen = [f"{name}_mm3_per_s" for name in ("wanted", *drawn)]
     return Deciding(
-        "Deposition, the part that decides",
         finding,
-        wide,
-        narrow,
+        draw_flows(stretch, drawn, finding, PICTURE),
         "",
         page.in_viewer("signals", part=[part.part], material=[part.material], y=seen),
     )

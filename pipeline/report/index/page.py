@@ -1,5 +1,5 @@
-"""Page one: what was run, the three loops with their verdicts, the case that decides, what changed since the
-accepted run, what to do next, and which file to load."""
+"""Page one: what was run, the three loops with their verdicts, the case that decides each and what its data
+cost, what changed since the accepted run, what to do next, and which file to load."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from pipeline.report.certificate import exported
 from pipeline.report.deposition import card as deposition_card
 from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.shared import headline, page, words
-from pipeline.report.shared.card import Card, CardStep, Deciding
+from pipeline.report.shared.card import Card, CardStep
 from pipeline.report.shared.difference import accepted_on
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import card as temperature_card
@@ -27,7 +27,7 @@ GRAVEST = (FAILED, OPEN, PASSED)
 def render(sources: Sources, judged: Judgement) -> str:
     """The text of index.html."""
     loops, verdicts = headline.loops(sources), sources.verdicts
-    first, picture = deciding(sources, judged, verdicts)
+    first = min(verdicts, key=lambda loop: GRAVEST.index(_graveness(verdicts[loop])))
     shown = cards(sources, judged, verdicts)
     told = changes.changes(sources, judged)
     return page.render(
@@ -40,7 +40,6 @@ def render(sources: Sources, judged: Judgement) -> str:
         data=data(sources),
         claim=f"{headline.claim(sources, list(verdicts))} {drifts(judged)}",
         cards=shown,
-        picture=picture,
         change=told,
         accepted_on=accepted_on(sources),
         machine=judged.changed.machine if judged.changed else {},
@@ -58,21 +57,6 @@ def cards(sources: Sources, judged: Judgement, verdicts: Mapping[str, Verdict]) 
         "setpoint": lambda verdict: setpoint_card.card(sources, verdict),
     }
     return [drawn[loop](verdict) for loop, verdict in verdicts.items()]
-
-
-def deciding(
-    sources: Sources, judged: Judgement, verdicts: Mapping[str, Verdict]
-) -> tuple[str, Deciding | Missing]:
-    """The loop whose verdict is the gravest, and the picture of the case that decides it; the next loop's
-    where that has none."""
-    order = sorted(verdicts, key=lambda loop: GRAVEST.index(_graveness(verdicts[loop])))
-    pictures = {
-        "temperature": lambda: temperature_card.deciding(sources, judged),
-        "deposition": lambda: deposition_card.deciding(sources, verdicts["deposition"]),
-        "setpoint": lambda: setpoint_card.deciding(sources, verdicts["setpoint"]),
-    }
-    drawn = [pictures[loop]() for loop in order]
-    return order[0], next((one for one in drawn if isinstance(one, Deciding)), drawn[0])
 
 
 def _graveness(verdict: Verdict) -> str:

@@ -1,5 +1,5 @@
-"""The setpoint loop on page one: the default, the agent, and doing nothing; and the cases of the rule that
-decides."""
+"""The setpoint loop on page one: a baseline, the model-based and the data-driven controller, among them the
+default; and the cases of the rule that decides."""
 
 from collections.abc import Sequence
 
@@ -9,6 +9,7 @@ from markupsafe import Markup
 from pipeline.report.setpoint import deciding as deciding_case
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.card import (
+    PICTURE,
     Card,
     CardCell,
     CardRow,
@@ -16,15 +17,15 @@ from pipeline.report.shared.card import (
     Deciding,
     Entrant,
     best_of,
+    in_order,
     of_verdict,
 )
 from pipeline.report.shared.sources import Sources
-from pipeline.setpoint.agents.criteria import BEYOND, FLOW_BAND
+from pipeline.setpoint.agents.criteria import FLOW_BAND
 from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.verdict.digits import THIN, band, count
 from pipeline.verdict.evidence import lookup
 from pipeline.verdict.setpoint import (
-    DATA_DRIVEN,
     Board,
     Case,
     Harm,
@@ -40,20 +41,29 @@ from pipeline.verdict.setpoint import (
 )
 from pipeline.verdict.verdict import FAILED, PASSED, Figure, Missing, Verdict
 
-MOVES, TITLE = "Nozzle camera to setpoints", "Setpoint, the case that decides"
+MOVES = "Nozzle camera to setpoints"
 # cases that the picture has room for, the worst first
 MOST_CASES = 8
 
 
 def card(sources: Sources, verdict: Verdict) -> Card:
-    """Settling, staying and harm of the default, the agent and doing nothing."""
+    """Settling, staying and harm of the three."""
     scores, step = board(sources.evidence, sources.subject("setpoint")), _step(sources, verdict)
     if isinstance(scores, Missing) or not verdict.winner:
         why = scores.sentence() if isinstance(scores, Missing) else verdict.reason
         return of_verdict(
-            verdict, MOVES, step, entrants=[], rows=[], basis="", beside="", sources=[], missing=why
+            verdict,
+            MOVES,
+            step,
+            entrants=[],
+            rows=[],
+            basis="",
+            cost="",
+            picture=Missing("not measured", why),
+            sources=[],
+            missing=why,
         )
-    names, asked = shown(sources, scores), sources.declared.rules
+    names, asked = shown(scores), sources.declared.rules
     limits = bars(sources.evidence, scores)
     harms = [harm_of(scores, name, limits) for name in names]
     limit = next((harm.limit for harm in harms if isinstance(harm, Harm)), None)
@@ -61,46 +71,37 @@ def card(sources: Sources, verdict: Verdict) -> Card:
         verdict,
         MOVES,
         step,
-        entrants=[Entrant(role(scores, name), name, note) for name, note in _notes(sources, scores, names)],
+        entrants=[Entrant(role(scores, name), name, scores.kinds[name]) for name in names],
         rows=[
             _shares("Settles", scores, names, "settled", asked.settled_percent),
             _shares("Stays", scores, names, "stay", asked.stay_percent),
-            CardRow("Harm", "" if limit is None else f"≤ {limit:g}{THIN}%", _harm_cells(harms, limit)),
+            CardRow(
+                "Good prints moved", "" if limit is None else f"≤ {limit:g}{THIN}%", _harm_cells(harms, limit)
+            ),
         ],
-        basis=f"Worst case of each; small: 95{THIN}% interval, by segment. Harm: good prints that leave "
-        f"±{BEYOND[-1]}{THIN}%.",
-        beside=verdict.short_answer,
+        basis=f"Worst case; small: 95{THIN}% interval",
+        cost=_cost(sources),
+        picture=deciding(sources, verdict),
         sources=sources.source("scoreboard"),
     )
 
 
-def shown(sources: Sources, scores: Board) -> list[str]:
-    """The default, then the other one of the pair, then what was accepted, else doing nothing."""
-    mine = scores.default
-    other = scores.baseline() if scores.kinds[mine] == DATA_DRIVEN else scores.learned()
-    third = [accepted(sources), DOES_NOTHING, *scores.names]
-    names = [mine, *([other] if other else [])]
-    return [*names, *[name for name in third if name in scores.kinds and name not in names][:1]]
+def shown(scores: Board) -> list[str]:
+    """The best baseline that does something, the model-based and the data-driven controller, among them the
+    default."""
+    of_kind: dict[str, str] = {}
+    for name in (scores.default, *scores.names):
+        if name and name != DOES_NOTHING:
+            of_kind.setdefault(scores.kinds[name], name)
+    return list(in_order({name: scores.kinds[name] for name in of_kind.values()}))
 
 
-def accepted(sources: Sources) -> str:
-    """The default of the accepted run; "" without one."""
-    if not isinstance(sources.accepted, dict):
+def _cost(sources: Sources) -> str:
+    """Segments of prints and pictures that were learned from."""
+    data = lookup(sources.metrics["train_classifier"], "data")
+    if isinstance(data, Missing):
         return ""
-    found = lookup(sources.accepted, "metrics.evaluate_setpoint.default")
-    return "" if isinstance(found, Missing) else str(found)
-
-
-def _notes(sources: Sources, scores: Board, names: Sequence[str]) -> list[tuple[str, str]]:
-    before = accepted(sources)
-    return [
-        (
-            name,
-            "as before" if name == before else "closest" if i == 0
-            else scores.kinds[name],
-        )
-        for i, name in enumerate(names)
-    ]  # fmt: skip
+    return f"{data['segments']:,} segments, {data['frames']:,} pictures"
 
 
 def _shares(title: str, scores: Board, names: Sequence[str], what: str, limit: float) -> CardRow:
@@ -138,7 +139,7 @@ def _step(sources: Sources, verdict: Verdict) -> CardStep:
         return CardStep("Run the stages of this loop.", "./run dvc repro evaluate_setpoint")
     if verdict.rehearsal:
         return CardStep(
-            "Print the training print and put its frames into datasets/raw/setpoint.",
+            "Film the training print; frames go to datasets/raw/setpoint.",
             "./run beadline training-print training.gcode",
         )
     if verdict.state == PASSED:
@@ -151,7 +152,7 @@ def _step(sources: Sources, verdict: Verdict) -> CardStep:
 
 def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     """The case that decides, decision by decision; where its runs were not kept, runs that settle, or settle
-    and stay, in every case that counts, the worst first. Of the default, the agent and doing nothing."""
+    and stay, in every case that counts, the worst first. Of the three of the card."""
     scores = board(sources.evidence, sources.subject("setpoint"))
     if isinstance(scores, Missing):
         return scores
@@ -160,7 +161,7 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     stays, asked = verdict.rule.startswith("Stays"), sources.declared.rules
     limit = asked.stay_percent if stays else asked.settled_percent
     what, does = ("stay", "settle and stay") if stays else ("settled", "settle")
-    names = shown(sources, scores)
+    names = shown(scores)
     cases = [case for case, cell in scores.counting(scores.default) if isinstance(_of(cell, what), Figure)]
     cases.sort(key=lambda case: _value(scores, names[0], case, what))
     if not cases:
@@ -168,26 +169,21 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     first, more = cases[0], len(cases) - MOST_CASES
     listed = ", ".join(f"{name} {_text(scores, name, first, what)}" for name in names)
     entrants = [Entrant(role(scores, name), name, "") for name in names]
-    traced = deciding_case.panels(sources, scores, first, names)
+    traced = deciding_case.panel(sources, scores, first, names)
     if not isinstance(traced, Missing):
         return Deciding(
-            TITLE,
-            f"Runs that {does} in {within(first)}: {listed}; at least {limit:g}{THIN}% are to.",
-            traced.wide,
-            traced.narrow,
-            f"{deciding_case.reading(names)} Dashed: ±{FLOW_BAND:g}{THIN}%.",
-            page.linked(sources.source("paths")),
+            f"Runs that {does} in {within(first)}: {listed}.",
+            traced,
+            f"Median and 80{THIN}% of the runs; dashed: ±{FLOW_BAND:g}{THIN}%.",
+            page.linked(sources.source("paths"), short=True),
             entrants,
         )
     finding = f"Runs that {does}, by case; the case that decides first, {within(first)}: {listed}."
-    sizes = ((566, 212, 190), (350, 250, 150))
-    wide, narrow = (_drawn(scores, names, cases[:MOST_CASES], what, limit, finding, size) for size in sizes)
+    drawn = _drawn(scores, names, cases[:MOST_CASES], what, limit, finding, (*PICTURE, 150))
     beyond = f" {count(more, 'better case').capitalize()} on the loop’s page." if more > 0 else ""
     return Deciding(
-        TITLE,
         finding,
-        wide,
-        narrow,
+        drawn,
         f"Line: the limit, {limit:g}{THIN}%. Bars: 95{THIN}% intervals.{beyond}",
         page.linked(sources.source("scoreboard")),
         entrants,

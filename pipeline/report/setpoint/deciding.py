@@ -8,6 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
+from pipeline.report.shared.card import PICTURE
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND
@@ -136,22 +137,13 @@ def picture(sources: Sources, board: Board | Missing) -> Picture:
     )
 
 
-class Panels(NamedTuple):
-    """The flow for a screen, and narrow for a phone."""
-
-    wide: Markup
-    narrow: Markup
-
-
-def panels(sources: Sources, board: Board, case: Case, names: Sequence[str]) -> Panels | Missing:
+def panel(sources: Sources, board: Board, case: Case, names: Sequence[str]) -> Markup | Missing:
     """The flow of these controllers in a case, as page one draws it; why there is none."""
     found = traces(sources.tables["paths"], case, names)
     if isinstance(found, Missing):
         return found
-    x, told = _decisions(found), finding(found)
-    sizes = ((566, 212), (350, 250))
-    frames = [charts.Frame(x, FLOW, width, height, 34, 34, 16, 14) for width, height in sizes]
-    return Panels(*(_flow(board, found, frame, alt=told, page_one=True) for frame in frames))
+    frame = charts.Frame(_decisions(found), FLOW, *PICTURE, 34, 34, 16, 14)
+    return _flow(board, found, frame, alt=finding(found), page_one=True)
 
 
 def reading(names: Iterable[str]) -> str:

@@ -2,13 +2,13 @@
 figures, the picture of the case that decides, and what to do next."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from markupsafe import Markup
 
 from pipeline.report.shared.sources import SourceFile
-from pipeline.verdict.verdict import PASSED, Verdict
+from pipeline.verdict.verdict import Missing, Verdict
 
 # letters of a reason that a card has room for in the widest font
 ROOM = 200
@@ -46,22 +46,24 @@ class CardStep(NamedTuple):
     command: str
 
 
+# width and height of a card's picture, px
+PICTURE = (332, 124)
+
+
 class Deciding(NamedTuple):
-    """The case that decides a loop as a picture: for a screen, and narrow for a phone. `entrants`
+    """The case that decides a loop as a picture in which its controllers lie over one another. `entrants`
     are those whose marks it shows; `key` says how to read it; `origin` leads to its data."""
 
-    title: str
     finding: str
-    wide: Markup
-    narrow: Markup
+    drawn: Markup
     key: str
     origin: Markup
     entrants: Sequence[Entrant] = ()
 
 
 class Card(NamedTuple):
-    """One loop. `basis` says what the small figures are; `beside` is a sentence below the table; `missing`
-    says why there are no figures."""
+    """One loop. `basis` says what the small figures are; `picture` is the case that decides, or why there is
+    none; `cost` is what the data cost; `missing` says why there are no figures."""
 
     loop: str
     moves: str
@@ -72,7 +74,9 @@ class Card(NamedTuple):
     entrants: Sequence[Entrant]
     rows: Sequence[CardRow]
     basis: str
-    beside: str
+    answer: str
+    cost: str
+    picture: Deciding | Missing
     step: CardStep
     sources: Sequence[SourceFile]
     missing: str = ""
@@ -98,6 +102,7 @@ def of_verdict(verdict: Verdict, moves: str, step: CardStep, **rest: Any) -> Car
         verdict.decision,
         verdict.lead,
         first_sentence(verdict.reason),
+        answer=verdict.short_answer,
         step=step,
         **rest,
     )
@@ -109,6 +114,9 @@ def best_of(values: Sequence[float | None], *, at_least: bool) -> float | None:
     return (max if at_least else min)(known) if len(known) > 1 else None
 
 
-def note_of(verdict: Verdict) -> str:
-    """What the controller is that the verdict is about."""
-    return "named" if verdict.state == PASSED else "closest"
+def in_order(kinds: Mapping[str, str], runs_now: str = "") -> dict[str, str]:
+    """{controller: its kind}, baselines first, then model-based, then data-driven, with the one that runs now
+    named so."""
+    order = ("baseline", "model-based", "data-driven")
+    ranked = sorted(kinds, key=lambda name: order.index(kinds[name]) if kinds[name] in order else len(order))
+    return {name: f"{kinds[name]}, runs now" if name == runs_now else kinds[name] for name in ranked}

@@ -1,35 +1,37 @@
-"""The temperature loop on page one: the contestant that the verdict is about, its rival, and what runs now,
-PI or doing nothing; and the case that decides."""
+"""The temperature loop on page one: a baseline, the model-based and the data-driven controller, with the one
+that the verdict is about among them; and the case that decides."""
 
 import math
 from collections.abc import Sequence
 
 import numpy as np
+from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.card import (
+    PICTURE,
     Card,
     CardCell,
     CardRow,
     CardStep,
     Deciding,
     Entrant,
-    note_of,
+    in_order,
     of_verdict,
 )
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature.deciding import degrees, runs_of, until_settled
+from pipeline.report.temperature.deciding import runs_of, until_settled
 from pipeline.report.temperature.judgement import Judgement, named_before
-from pipeline.report.temperature.scorecard import setting
-from pipeline.verdict.controllers import heading, kind
+from pipeline.temperature.controllers.table import BY_NAME
+from pipeline.verdict.controllers import heading
 from pipeline.verdict.digits import THIN, count, declared, short, with_unit
 from pipeline.verdict.evidence import Table, lookup
-from pipeline.verdict.temperature import comparison
+from pipeline.verdict.pairs import pair_names
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, Verdict, state
 from pipeline.verdict.wording import OFF_THE_SCALE, banded, places_of, worded
 
 MOVES = "Heaters and motor to barrel temperatures"
-# who stands beside the pair where nobody runs yet: PI, or doing nothing where the verdict is about PI
+# the baseline that stands beside the pair if nobody runs yet
 PI, IDLE = ("pi_simc", "pi"), "hold"
 # the first two figures of the card; the third is the one that decides, else overshoot
 FIGURES = ("settled_error", "settling")
@@ -39,7 +41,7 @@ STYLES = {"dd": "line dd", "mb": "line", "bl": "line bl"}
 
 
 def card(sources: Sources, judged: Judgement, verdict: Verdict) -> Card:
-    """Three figures of the contestant, its rival and a yardstick."""
+    """Three figures of a baseline, the model-based and the data-driven controller."""
     names = contestants(sources, judged)
     asked = {question.key: question for question in judged.asked}
     third = next((q.key for q in judged.asked if verdict.rule and q.rule == verdict.rule), "overshoot")
@@ -52,25 +54,32 @@ def card(sources: Sources, judged: Judgement, verdict: Verdict) -> Card:
         _step(sources, verdict),
         entrants=[Entrant(name, heading(name), note) for name, note in names.items()],
         rows=[_row(asked[key], judged, list(names)) for key in keys if key in asked] if told else [],
-        basis=f"90{THIN}% quantile of {setting(comparison(sources.metrics))}; small: its 90{THIN}% band.",
-        beside=verdict.short_answer,
+        basis=f"90{THIN}% quantile; small: 90{THIN}% band",
+        cost=_cost(sources),
+        picture=deciding(sources, judged),
         sources=sources.source("evaluate_temperature"),
         missing=gap.sentence() if isinstance(gap, Missing) else "",
     )
 
 
 def contestants(sources: Sources, judged: Judgement) -> dict[str, str]:
-    """Whom the card shows, and what each is here."""
+    """Whom the card shows, and what each is here: the pair, the one that the verdict is about, and what runs
+    now or a PI if there is room."""
     runs = named_before(sources)
-    champion = isinstance(sources.nightly, dict) and runs
-    runs_now = "runs now" if champion else "as before"
-    names = {judged.subject: runs_now if judged.subject == runs else note_of(judged.verdict)}
-    names[judged.rival] = runs_now if judged.rival == runs else kind(judged.rival)
-    yardsticks = (IDLE,) if set(names) & set(PI) else (*PI, IDLE)
-    third = next(
-        (name for name in (runs, *yardsticks) if name and name not in names and judged.answers.get(name)), ""
-    )
-    return names | ({third: runs_now if third == runs else "yardstick"} if third else {})
+    champion = runs if isinstance(sources.nightly, dict) else ""
+    wanted = [judged.subject, *pair_names(sources.metrics), *([runs] if runs else []), *PI, IDLE]
+    there = [name for name in dict.fromkeys(wanted) if name == judged.subject or judged.answers.get(name)]
+    kinds = {name: BY_NAME[name].kind if name in BY_NAME else "" for name in there[:3]}
+    return in_order(kinds, champion)
+
+
+def _cost(sources: Sources) -> str:
+    """Minutes of record that were learned from."""
+    samples = lookup(sources.metrics["ingest"], "samples")
+    if isinstance(samples, Missing):
+        return ""
+    minutes = samples * sources.declared.machine.sample_time_s / 60
+    return f"{short(minutes, 3)} minutes of record"
 
 
 def _row(question: Question, judged: Judgement, names: Sequence[str]) -> CardRow:
@@ -154,39 +163,38 @@ def deciding(sources: Sources, judged: Judgement) -> Deciding | Missing:
         who: float(np.abs(table[zone] - table[f"{zone}_reference"])[rows[-1]]) for who, rows in runs.items()
     }
     listed = ", ".join(f"{i} {heading(who)} {short(end, 2)}" for i, (who, end) in enumerate(ends.items(), 1))
-    finding = (
-        f"{label[:1].upper()}{label[1:]} ends off its reference (dashed) by, in °C: {listed}. "
-        f"{judged.deciding}"
-    )
-    step = sources.declared.machine.sample_time_s
-    convention = "" if sources.recorded else f" One step counts as {step:g}{THIN}s, by convention."
-    wide, narrow = (_drawn(table, early, zone, finding, size) for size in ((566, 212), (350, 240)))
+    finding = f"{label[:1].upper()}{label[1:]} ends off its reference by, in °C: {listed}. Grey: the limit."
     return Deciding(
-        "Temperature, the case that decides",
         finding,
-        wide,
-        narrow,
-        convention.strip(),
+        _drawn(table, early, zone, sources.declared.rules.settled_error_degC, finding, PICTURE),
+        "",
         page.in_viewer("trajectories", case_name=["deciding"], contestant=list(runs), y=[zone]),
     )
 
 
-def _drawn(table: Table, runs: dict[str, np.ndarray], zone: str, alt: str, size: tuple[int, int]):
+def _drawn(
+    table: Table, runs: dict[str, np.ndarray], zone: str, limit: float, alt: str, size: tuple[int, int]
+) -> Markup:
+    """By how much the zone is off its reference, log scale, the controllers over one another, each with its
+    number; the grey line is the limit of the settled error."""
     time, rows = table["time_s"], np.concatenate(list(runs.values()))
+    off = np.abs(table[zone] - table[f"{zone}_reference"])
+    finite = off[rows][np.isfinite(off[rows])]
+    most = float(min(max(finite.max(initial=1.0), 2 * limit), 1e4))
+    ticks = tuple((tick, f"{tick:g}") for tick in (0.01, 0.1, limit, 10.0, 100.0) if tick < most)
     frame = charts.Frame(
-        charts.linear(0, float(time[rows].max()) or 1.0), degrees(table, rows, zone), *size, 40, 34, 22, 14
-    )
-    first = next(iter(runs.values()))
-    layers = [charts.line(frame, time[first], table[f"{zone}_reference"][first], "ref")]
-    used = set()
+        charts.linear(0, float(time[rows].max()) or 1.0), charts.Axis(0.01, most, ticks, True),
+        *size, 40, 34, 22, 14,
+    )  # fmt: skip
+    layers, used = [charts.level(frame, limit, "lim")], set()
     for i, (who, mine) in enumerate(runs.items(), 1):
-        style, y = STYLES.get(page.MARKS.get(who, "bl"), "line"), table[zone][mine]
+        style, y = STYLES.get(page.MARKS.get(who, "bl"), "line"), np.maximum(off[mine], 0.01)
         layers.append(charts.line(frame, time[mine], y, style + (" dash" if style in used else ""), most=120))
         used.add(style)
         # a number of its own height each, where the line comes by
-        at = int(np.argmax(np.abs(y - y[0]) >= np.ptp(y) * i / (len(runs) + 1)))
+        at = int(np.argmax(np.log(y) <= np.log(y[0]) + (np.log(0.1) - np.log(y[0])) * i / (len(runs) + 1)))
         layers.append(charts.label(frame, time[mine[at]], y[at], str(i), dx=5, dy=4))
     return charts.panel(
-        frame, layers, alt=alt, css="mb lead-picture", title="temperature, °C", across="time, s",
+        frame, layers, alt=alt, css="mb lead-picture", title="off the reference, °C, log", across="time, s",
         units=("s", "°C"),
     )  # fmt: skip
