@@ -52,7 +52,8 @@ def pair_sentence(figures: Figures) -> PairSentence:
     amount = "far less" if not gain <= 90 else f"{number(gain, 0 if gain >= 10 else 1)} % less"
     interval = _interval(pair, sign=sign) if gain <= 90 else ""
     text = f"{better} costs {amount} than {worse} on the same {plants} plants"
-    return PairSentence(f"{head} {text}{_bracket(interval, chance)}.", str(winner), note=instead)
+    short = f"{head} {better}, {amount.replace('less', 'lower')} cost{_bracket(interval)}."
+    return PairSentence(f"{head} {text}{_bracket(interval, chance)}.", str(winner), short, instead)
 
 
 def _interval(pair: Mapping[str, Any], *, sign: int) -> str:

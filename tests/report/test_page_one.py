@@ -30,7 +30,7 @@ def first(reports):
 def cards(first):
     """Text of each loop's card."""
     starts = [first.text.index(words) for words in ("Heaters and motor", "Plunger command", "Nozzle camera")]
-    ends = [*starts[1:], first.text.index("Next Temperature")]
+    ends = [*starts[1:], first.text.index("Since the")]
     return {loop: first.text[a:b] for loop, a, b in zip(LOOPS, starts, ends, strict=True)}
 
 
@@ -72,44 +72,55 @@ def test_deposition_shows_the_worst_stream_of_each_composer_and_the_range(report
     asked = [6.0]
     of_library = scores[scores.composer.isin(["priority", "superposition"])]
     library = of_library.groupby("composer").rms_percent_of_on_off.max().idxmin()
-    for composer in ("basis", library, "on_off"):
+    for composer in ("on_off", "basis", library):
         errors = scores.rms_percent_of_on_off[scores.composer == composer]
         asked += [errors.max()] + ([errors.min(), errors.max()] if np.ptp(errors) else [])
     np.testing.assert_allclose(shown, asked, atol=0.51)
     lines = numbers(row(cards["deposition"], "Line volume", "Above learning"))
     worst = scores.worst_line_volume_percent[scores.composer == "basis"].max()
-    assert lines[:2] == pytest.approx([3.0, worst], abs=0.051)
+    assert lines[0] == 3.0 and any(line == pytest.approx(worst, abs=0.051) for line in lines[2:3])
 
 
 def test_setpoint_shows_the_worst_case_of_each_controller_with_its_interval(reports, cards):
     board = pd.read_parquet(reports.parent / "datasets/evaluate_setpoint/scoreboard.parquet")
-    counting = board[board.counts & (board.controller == "Bayes filter")]
-    worst = counting.loc[counting.settled_percent.idxmin()]
-    ends = [worst.settled_percent, worst.settled_low_percent, worst.settled_high_percent]
+    ends = []
+    for name in ("sequential test", "Bayes filter", "paper's agent"):
+        counting = board[board.counts & (board.controller == name)]
+        worst = counting.loc[counting.settled_percent.idxmin()]
+        ends += [worst.settled_percent, worst.settled_low_percent, worst.settled_high_percent]
     shown = numbers(row(cards["setpoint"], "Settles", "Stays"))
-    np.testing.assert_allclose(shown[1 : 1 + len(ends)], ends, atol=0.051)
+    np.testing.assert_allclose(shown[1:], ends, atol=0.051)
 
 
-def test_next_names_each_loop_once_and_its_commands_are_commands(first):
+def test_each_card_names_one_next_step_and_its_command_is_a_command(cards):
     from pipeline.cli import EXAMPLES
 
-    place = first.text[first.text.index("Next Temperature") : first.text.index("Since the")]
-    for loop in LOOPS:
-        assert place.count(f"{loop.capitalize()} ") == 1
-    found = re.findall(r"\./run (?:beadline ([\w-]+)|dvc (repro))", place)
-    assert len(found) == 3 and all(name in EXAMPLES or repro for name, repro in found)
+    for card in cards.values():
+        found = re.findall(r"\./run (?:beadline ([\w-]+)|dvc (repro))", card[card.index(" Next ") :])
+        assert len(found) == 1 and all(name in EXAMPLES or repro for name, repro in found)
 
 
 def test_the_files_and_the_certificate_are_those_of_the_export_with_the_first_digits_of_their_hash(
-    reports, first
+    reports, cards
 ):
     exported = metrics(reports, "export_controllers")
-    place = first.text[first.text.index("Files and") :]
     for loop in LOOPS:
+        place = cards[loop][cards[loop].index(" File ") :]
         for path, sha256 in list((exported.get(loop, {}).get("files") or {}).items())[:1]:
             assert Path(path).name in place or "controller.json" in place
             assert any(digits[:8] in place for digits in exported[loop]["files"].values()), sha256
-    assert exported["temperature"]["certificate"]["sha256"][:8] in place
+    assert exported["temperature"]["certificate"]["sha256"][:8] in cards["temperature"]
+
+
+def test_what_the_data_cost_is_what_the_stages_read(reports, cards):
+    samples = metrics(reports, "ingest")["samples"]
+    minutes = float(re.search(r"Learned from ([\d.,]+) minutes of record", cards["temperature"])[1])
+    assert minutes == pytest.approx(samples / 60, rel=0.01)  # a second a sample
+    trials = pd.read_parquet(reports.parent / "datasets/train_ilc/trials.parquet")
+    prints = (trials.law == "model_inverse").sum()
+    assert f"Learned from {prints} prints of training routines" in cards["deposition"]
+    data = metrics(reports, "train_classifier")["data"]
+    assert f"Learned from {data['segments']:,} segments, {data['frames']:,} pictures" in cards["setpoint"]
 
 
 def test_no_link_leads_out_of_the_folder_of_the_pages(reports):
@@ -163,5 +174,5 @@ def test_the_deciding_picture_draws_the_recorded_run_to_its_last_value(reports, 
 
 
 def test_what_changed_is_counted_for_every_loop(first):
-    place = first.text[first.text.index("Since the") : first.text.index("Files and")]
+    place = first.text[first.text.index("Since the") :]
     assert "First run: nothing to compare with." in place

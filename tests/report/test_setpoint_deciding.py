@@ -117,8 +117,10 @@ def test_the_last_case_stands_first_where_it_decides_and_is_drawn_on_both_pages(
     assert link["case"] == [HALF[1]]
     assert link["controller"] == ["Bayes filter", "paper's agent", "do nothing"]
     one = INDEX.read_text()
-    assert one.count("clog to 60") == 2 and "Runs that settle, by case" not in one
-    assert "Runs that settle and stay in recorded windows, sticky, half clog: Bayes filter 40.0" in one
+    assert one.count("clog to 60") == 1 and "Runs that settle, by case" not in one
+    assert re.search(
+        r"settle and stay in recorded windows, sticky, half clog: [^.]*[\d.]+\s%, Bayes filter 40\.0", one
+    )
     clogs = [run for run in manifest(Path("reports").absolute())["tables"] if run["name"] == "paths"][0][
         "events"
     ]

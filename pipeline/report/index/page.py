@@ -1,7 +1,7 @@
 """Page one: what was run, the three loops with their verdicts, the case that decides each and what its data
 cost, what changed since the accepted run, what to do next, and which file to load."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,24 +11,19 @@ from pipeline.report.certificate import exported
 from pipeline.report.deposition import card as deposition_card
 from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.shared import headline, page, words
-from pipeline.report.shared.card import Card, CardStep
+from pipeline.report.shared.card import Card
 from pipeline.report.shared.difference import accepted_on
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import card as temperature_card
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.twelve import drift_state
 from pipeline.verdict.digits import count, shortened
-from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
-
-# the gravest first
-GRAVEST = (FAILED, OPEN, PASSED)
+from pipeline.verdict.verdict import FAILED, PASSED, Missing, Verdict
 
 
 def render(sources: Sources, judged: Judgement) -> str:
     """The text of index.html."""
     loops, verdicts = headline.loops(sources), sources.verdicts
-    first = min(verdicts, key=lambda loop: GRAVEST.index(_graveness(verdicts[loop])))
-    shown = cards(sources, judged, verdicts)
     told = changes.changes(sources, judged)
     return page.render(
         "index.html",
@@ -39,11 +34,10 @@ def render(sources: Sources, judged: Judgement) -> str:
         state=headline.state(loops),
         data=data(sources),
         claim=f"{headline.claim(sources, list(verdicts))} {drifts(judged)}",
-        cards=shown,
+        cards=cards(sources, judged, verdicts),
         change=told,
         accepted_on=accepted_on(sources),
         machine=judged.changed.machine if judged.changed else {},
-        steps=steps(shown, first),
         files=files(sources, judged.verdict),
         words=words.chosen(sources, words.INDEX),
     )
@@ -57,16 +51,6 @@ def cards(sources: Sources, judged: Judgement, verdicts: Mapping[str, Verdict]) 
         "setpoint": lambda verdict: setpoint_card.card(sources, verdict),
     }
     return [drawn[loop](verdict) for loop, verdict in verdicts.items()]
-
-
-def _graveness(verdict: Verdict) -> str:
-    return verdict.state if verdict.state in (FAILED, PASSED) else OPEN
-
-
-def steps(shown: Sequence[Card], first: str) -> list[tuple[str, CardStep]]:
-    """(loop, what to do next), that of the loop that decides first."""
-    ordered = sorted(shown, key=lambda card: card.loop != first)
-    return [(card.loop, card.step) for card in ordered]
 
 
 def data(sources: Sources) -> str:
@@ -96,15 +80,13 @@ def drifts(judged: Judgement) -> str:
     return f"Drift: temperature {word[:1].lower()}{word[1:].rstrip('.')}, not measured in the others."
 
 
-def files(sources: Sources, verdict: Verdict) -> list[dict[str, Any]] | Missing:
-    """What leaves the house, a line a loop."""
+def files(sources: Sources, verdict: Verdict) -> dict[str, dict[str, Any]]:
+    """{loop: what leaves the house}; {} if nothing was exported."""
     lines = exported.lines(sources, verdict)
     if isinstance(lines, Missing):
-        return lines
-    return [
-        {
-            "loop": line.loop,
-            "name": line.name,
+        return {}
+    return {
+        line.loop: {
             "path": line.file,
             "sha256": line.sha256,
             "state": line.state,
@@ -113,4 +95,4 @@ def files(sources: Sources, verdict: Verdict) -> list[dict[str, Any]] | Missing:
             "link": exported.link(sources, line),
         }
         for line in lines
-    ]
+    }
