@@ -44,3 +44,9 @@ def test_the_page_takes_the_colour_of_the_worst_loop_that_was_measured():
     assert state(three("passed", "open", "not measured")) == "open"
     assert state(three("passed", "passed", "not measured")) == "passed"
     assert state(three("not measured", "not measured", "not measured")) == "open"
+
+
+def test_every_page_says_in_its_head_that_its_machine_is_simulated(reports):
+    for path in reports.glob("*.html"):
+        head = path.read_text(encoding="utf-8").split("</header>")[0 if path.stem != "index" else 1]
+        assert "Simulated machines" in head.split("<h2")[0], path.name

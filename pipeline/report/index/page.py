@@ -4,8 +4,6 @@ cost, what changed since the accepted run, what to do next, and which file to lo
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from pipeline.report.about import changes
 from pipeline.report.certificate import exported
 from pipeline.report.deposition import card as deposition_card
@@ -17,7 +15,6 @@ from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import card as temperature_card
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.twelve import drift_state
-from pipeline.verdict.digits import count, shortened
 from pipeline.verdict.verdict import FAILED, PASSED, Missing, Verdict
 
 
@@ -32,7 +29,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         title=headline.decision(loops, quick=sources.quick).rstrip("."),
         decision=headline.decision(loops, quick=sources.quick),
         state=headline.state(loops),
-        data=data(sources),
+        data=headline.data(sources, list(verdicts)),
         claim=f"{headline.claim(sources, list(verdicts))} {drifts(judged)}",
         cards=cards(sources, judged, verdicts),
         change=told,
@@ -51,25 +48,6 @@ def cards(sources: Sources, judged: Judgement, verdicts: Mapping[str, Verdict]) 
         "setpoint": lambda verdict: setpoint_card.card(sources, verdict),
     }
     return [drawn[loop](verdict) for loop, verdict in verdicts.items()]
-
-
-def data(sources: Sources) -> str:
-    """On whose data the loops were judged: simulated machines, or which recordings."""
-    names = list(sources.verdicts)
-    made = [name for name in names if headline.simulated(sources, name)]
-    if len(made) == len(names):
-        return "Simulated machines; no recording was read."
-    table = sources.tables["record"]
-    read = [] if isinstance(table, Missing) or not sources.recorded else list(np.unique(table["recording"]))
-    listed = ", ".join(shortened(str(name), 40) for name in read[:2])
-    more = f" and {len(read) - 2} more" if len(read) > 2 else ""
-    told = {"temperature": f"temperature {count(len(read), 'recording')} ({listed}{more})" if read else ""}
-    theirs = [
-        told.get(name) or f"{name} recordings of datasets/raw/{name}" for name in names if name not in made
-    ]
-    simulated = [f"{' and '.join(made)} simulated"] if made else []
-    text = "; ".join([*theirs, *simulated])
-    return f"{text[:1].upper()}{text[1:]}."
 
 
 def drifts(judged: Judgement) -> str:

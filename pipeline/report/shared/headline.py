@@ -4,8 +4,12 @@ decision, the rule that decided it and what to do."""
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict import loops as verdict_loops
+from pipeline.verdict.digits import count, shortened
+from pipeline.verdict.verdict import Missing
 
 NAMES = ("temperature", "deposition", "setpoint")
 MOVES = ("heaters to barrel", "plunger to flow", "camera to setpoints")
@@ -67,6 +71,24 @@ def claim(sources: Sources, names: Sequence[str] = NAMES) -> str:
             f"{which}judged on simulated machines only: nothing is claimed about a real printer".strip()
         )
     text = "; ".join(claims)
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def data(sources: Sources, names: Sequence[str]) -> str:
+    """On whose data these loops were judged: simulated machines, or which recordings."""
+    made = [name for name in names if simulated(sources, name)]
+    if len(made) == len(names):
+        return "Simulated machines; no recording was read."
+    table = sources.tables["record"]
+    read = [] if isinstance(table, Missing) or not sources.recorded else list(np.unique(table["recording"]))
+    listed = ", ".join(shortened(str(name), 40) for name in read[:2])
+    more = f" and {len(read) - 2} more" if len(read) > 2 else ""
+    told = {"temperature": f"temperature {count(len(read), 'recording')} ({listed}{more})" if read else ""}
+    theirs = [
+        told.get(name) or f"{name} recordings of datasets/raw/{name}" for name in names if name not in made
+    ]
+    others = [f"{' and '.join(made)} simulated"] if made else []
+    text = "; ".join([*theirs, *others])
     return f"{text[:1].upper()}{text[1:]}."
 
 

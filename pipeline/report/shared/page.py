@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import jinja2
 from markupsafe import Markup, escape
 
+from pipeline.report.shared import headline
 from pipeline.report.shared.pictures import PictureColumn
 from pipeline.report.shared.sources import SourceFile, Sources
 from pipeline.store import artifacts
@@ -103,7 +104,10 @@ def render(template: str, *, sources: Sources | None = None, **values) -> str:
     # the pages of a loop that is switched off say so, and no page leads to them
     off = [] if sources is None else [key for key, loop in LOOP_OF.items() if loop not in sources.verdicts]
     beside = [("nightly", "Nightly")] if nightly else []
-    frame = {"beside": beside, "quick": quick, "sources": sources, "off": off}
+    loop = LOOP_OF.get(values["here"])
+    judged = [] if sources is None else [loop] if loop in sources.verdicts else list(sources.verdicts)
+    data = headline.data(sources, judged).split("; no")[0].rstrip(".") if sources and judged else ""
+    frame = {"beside": beside, "quick": quick, "sources": sources, "off": off, "machine_of": data}
     return printable_page(environment().get_template(template).render(**frame, **values))
 
 
