@@ -244,6 +244,7 @@ def main() -> None:
         "reward": reward_figures(),
         "learning": rewards_of(agents, how),
         "search": searched,
+        "kept_from": artifacts.read_json("datasets/papers/train_agent/figures.json")["kept_from"],
         "camera": artifacts.read_json("datasets/papers/camera.json"),
         # nothing trains it on a CPU: 31 minutes of two cores for the paper's 73 epochs
         "paper_size": "not run",

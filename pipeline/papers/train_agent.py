@@ -1,5 +1,6 @@
 """The agent of Li and Pattinson (2025), trained in its own simulator by the best setting from the best seed
-of search_agent: writes datasets/papers/train_agent/, which every loop, page and quick look reads.
+of search_agent: writes datasets/papers/train_agent/, which every loop, page and quick look reads. The agent
+that lies there is kept if more of its validation runs stay: a paper is judged by the best known of it.
 
 `./run dvc repro datasets/papers/dvc.yaml:train_agent`; minutes. weights.safetensors: its network after each
 phase; agents.parquet: the learning curves; figures.json: what it comes to. No recording changes it.
@@ -10,12 +11,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from pipeline.papers import made
 from pipeline.papers.search_agent import TrainAgent, first_key, training
-from pipeline.setpoint.agents import agent, claims
-from pipeline.setpoint.agents.files import store_published
+from pipeline.setpoint.agents import agent, claims, trials
+from pipeline.setpoint.agents.files import restore_published, store_published
 from pipeline.setpoint.published import ALPHA, DELTA, SIGMA
 from pipeline.setpoint.simulation.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS
 from pipeline.setpoint.tables import AGENT_CURVE
@@ -23,6 +25,8 @@ from pipeline.store import artifacts, params
 from pipeline.store.pins import check_pins
 
 FOLDER = Path("datasets/papers/train_agent")
+# of the runs that choose between the agent that was trained and the one that lies there
+VALIDATED_SEED = 20
 # points of a learning curve that a page has room for, of each phase
 POINTS = 50
 
@@ -70,15 +74,35 @@ def guesses(how: agent.PublishedTraining) -> dict[str, Any]:
     }
 
 
+def validated_stay(network: agent.QNetwork, key: jax.Array, how: agent.PublishedTraining) -> float:
+    """Percent of the validation runs that settle and stay, on draws of their own."""
+    conditions = trials.starts(agent.VALIDATION_RUNS, accuracy=how.accuracy)
+    windows = agent.paper_windows()
+    return trials.evaluate(agent.published(network), network, windows, conditions, key).stay.percent
+
+
 def main() -> None:
     check_pins("train_agent")
     searched = artifacts.read_json("datasets/papers/search_agent.json")
     how = training(params.load(TrainAgent, "train_agent", params.PAPERS), searched["best"])
+    path, key = FOLDER / "weights.safetensors", jax.random.key(VALIDATED_SEED)
     published = agent.train_published(first_key(searched["seed"]), how)
+    networks, stay = published.networks, validated_stay(published.networks[-1], key, how)
+    kept: dict[str, Any] = {
+        "kept_from": "this search",
+        "validated_stay": stay,
+        "validated_stay_searched": stay,
+    }
+    if path.is_file():
+        known = restore_published(path).networks
+        if (known_stay := validated_stay(known[-1], key, how)) > stay:
+            networks, kept["guesses"] = known, artifacts.read_json(FOLDER / "figures.json")["guesses"]
+            kept |= {"kept_from": "an earlier search", "validated_stay": known_stay}
     FOLDER.mkdir(parents=True, exist_ok=True)
-    store_published(FOLDER / "weights.safetensors", published.networks)
-    artifacts.write_table(FOLDER / "agents.parquet", AGENT_CURVE, learning_curve(published))
-    artifacts.write_json(FOLDER / "figures.json", figures(how, published.networks))
+    if networks is published.networks:
+        store_published(path, networks)
+        artifacts.write_table(FOLDER / "agents.parquet", AGENT_CURVE, learning_curve(published))
+    artifacts.write_json(FOLDER / "figures.json", figures(how, networks) | kept)
     made.record("train_agent")
 
 
