@@ -110,7 +110,7 @@ def test_what_lies_uncommitted_is_used_and_named(project):
     summary = run()
     assert "promoted toy" in summary and "not committed: learn.py" in summary
     lineage = champion.read().champions["toy"].lineage
-    assert lineage.uncommitted == ("learn.py",) and lineage.recordings["toy"]
+    assert lineage["uncommitted"] == ["learn.py"] and lineage["recordings"]["toy"]
     assert project.dirty() == [" M learn.py", "?? helper.py"]
 
 
@@ -176,7 +176,7 @@ def test_an_idle_night_is_a_success_with_a_note_and_idle_nights_are_counted(proj
     assert "no new recording: drift was not measured" in run()
     assert "no new recording for 2 nights" in run()
     Path("learn.py").write_text(Path("learn.py").read_text() + "# other code\n")
-    assert "no new recording for 3 nights" in run() and remembered.nights()[-1].idle == 3
+    assert "no new recording for 3 nights" in run() and remembered.read().nights[-1].idle == 3
     project.record("new", [9.0])
     assert "no new recording" not in run()
 
@@ -203,11 +203,11 @@ def test_a_recording_that_is_not_used_says_which_parameter_would_use_it(project)
         "train_ilc.source: recordings in params.yaml to learn from what is recorded"
     )
     night.nightly(render_night)
-    assert sentence in remembered.nights()[-1].notes
+    assert sentence in remembered.read().nights[-1].notes
     sections["train_ilc"]["source"] = "recordings"
     Path("params.yaml").write_text(json.dumps(sections))
     night.nightly(render_night)
-    assert not any("is not used" in note for note in remembered.nights()[-1].notes)
+    assert not any("is not used" in note for note in remembered.read().nights[-1].notes)
 
 
 # ---- promote, keep, roll back
@@ -216,7 +216,7 @@ def test_a_recording_that_is_not_used_says_which_parameter_would_use_it(project)
 def test_a_worse_challenger_changes_the_run_and_not_production(project):
     before, head = project.production(), project.head()
     project.record("worse", [30.0])
-    assert "kept" in run() and "the challenger is no better" in remembered.nights()[-1].reasons[0]
+    assert "kept" in run() and "the challenger is no better" in remembered.read().nights[-1].reasons[0]
     assert project.production() == before and learned() == 15.75
     assert project.head() != head and champion.read().champions["toy"].run == "night-0001"
     assert project.dirty() == []
@@ -531,30 +531,10 @@ def test_a_full_disk_is_a_failed_night_that_says_so(project, tmp_path, room_mb):
         subprocess.run(["umount", "-l", disk], check=True)
 
 
-def test_a_clock_that_was_set_back_does_not_make_the_last_success_older(project):
-    success = datetime.datetime.fromisoformat(remembered.last().success)
-    hour = datetime.timedelta(hours=1)
-    assert "the clock was set back" in night.nightly(render_night, success - 12 * hour)[1]
-    assert remembered.last().success == success.isoformat()
-    # one of another century does not hold the watchdog for good
-    night.nightly(render_night, datetime.datetime(2100, 1, 1, tzinfo=datetime.UTC))
-    night.nightly(render_night, success + hour)
-    assert reporting.watchdog(success + hour)[0] == reporting.OK
-    assert "the last success was 47.0 h ago" in reporting.watchdog(success + 48 * hour)[1]
-
-
-@pytest.mark.parametrize(
-    ("file", "text"),
-    [
-        (".beadline/last.json", ""),
-        (".beadline/last.json", '{"night": "one"}'),
-        (".beadline/nights.json", "<<<<<<< HEAD"),
-        (".beadline/nights.json", "{}"),
-    ],
-)
-def test_a_broken_memory_is_told_by_the_watchdog_and_set_aside_by_the_night(project, file, text):
-    Path(file).write_text(text)
+@pytest.mark.parametrize("text", ["", '{"night": "one"}', "<<<<<<< HEAD", '{"nights": {}}'])
+def test_a_broken_memory_is_told_by_the_watchdog_and_set_aside_by_the_night(project, text):
+    remembered.FILE.write_text(text)
     status, summary = reporting.watchdog()
-    assert status == reporting.FAILED and file in summary and Path(file).exists()
-    assert f"it is set aside as {file}.broken" in run()
+    assert status == reporting.FAILED and str(remembered.FILE) in summary and remembered.FILE.exists()
+    assert f"it is set aside as {remembered.FILE}.broken" in run()
     assert "nothing new" in run()
