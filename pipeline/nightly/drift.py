@@ -104,11 +104,6 @@ class RoomAir(NamedTuple):
     draught: float
     another_season: bool = True
 
-    @property
-    def calm(self) -> bool:
-        """As still as any room, and the air as on the champion's own nights."""
-        return self.course <= CALM and not self.draught and not self.another_season
-
 
 # from a closed room to an open door; the record itself says which (empirical Bayes)
 RESTLESS = RoomAir(5.0, 0.0)

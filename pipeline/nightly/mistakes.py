@@ -54,8 +54,8 @@ def found(
     inputs: Sequence[str],
     outputs: Sequence[str],
 ) -> Mistake | None:
-    """The mistake that was made in writing a record; None where it is what it says, or where a change of the
-    machine explains it as well. Raises ValueError where the record is too short."""
+    """The mistake that was made in writing a record; None if it is what it says, or if a change of the
+    machine explains it as well. Raises ValueError if the record is too short."""
     asked = drift.record(machine, segments, own.scale, ROOM)
     as_is = baseline.misfit(asked, own.changes)
     if as_is < BETTER:
@@ -67,9 +67,7 @@ def found(
     samples = sum(int(one.measured.sum()) for one in asked.segments)
     every_delay = drift.DriftCause("delay", -1)  # which is a shifted clock by another name
     explained = [fit.explained for fit in drift.alone(asked, own.changes) if fit.cause != every_delay]
-    if as_is - max(explained) / samples < AS_MUCH * left:
-        return None
-    return mistake
+    return None if as_is - max(explained) / samples < AS_MUCH * left else mistake
 
 
 def honest(own: Baseline) -> float:
@@ -85,18 +83,9 @@ def likeliest(
     inputs: Sequence[str],
     outputs: Sequence[str],
 ) -> Mistake:
-    """Of all mistakes the one that explains the record best with it undone, be that well or not. Raises
-    ValueError where the record is too short."""
+    """Of all mistakes the one that explains the record best with it undone, be that well or not; mistakes
+    that explain as much are named with it. Raises ValueError if the record is too short."""
     as_is = baseline.misfit(drift.record(machine, segments, own.scale, ROOM), own.changes)
-    left, words, undone = _best(machine, segments, own, inputs, outputs)
-    return Mistake(words, undone, as_is / left)
-
-
-def _best(
-    machine: ProductionModel, segments: Segments, own: Baseline, inputs: Sequence[str], outputs: Sequence[str]
-) -> tuple[float, str, Segments]:
-    """Of the mistake that leaves least with it undone: what is left, its words with those of mistakes that
-    leave as little, and the record undone."""
 
     def left(undone: Segments) -> float:
         try:
@@ -109,10 +98,9 @@ def _best(
         undone = [undo(u, y) for u, y in segments]
         tried.append((left(undone), words, undone))
     tried.append(_clock(segments, left, machine.plant.sample_time_s))
-    tried.sort(key=lambda one: one[0])
-    least, words, undone = tried[0]
-    as_good = [other for cost, other, _ in tried[1:3] if cost < ALIKE * least]
-    return least, ", or ".join([words, *as_good]), undone
+    (least, words, undone), *others = sorted(tried, key=lambda one: one[0])
+    as_good = [other for cost, other, _ in others[:2] if cost < ALIKE * least]
+    return Mistake(", or ".join([words, *as_good]), undone, as_is / least)
 
 
 def _swaps(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.nightly import camera_drift
 from pipeline.nightly.inputs import quarantine
-from pipeline.nightly.records import Alarm, Drift
+from pipeline.nightly.records import Alarm, NightDrift
 from pipeline.nightly.settings import DriftLimits
 from pipeline.recordings import nozzle_frames, trial_files
 from pipeline.recordings.excluded import readable
@@ -56,7 +56,7 @@ def _frame_stats(trial: trial_files.TrialRecording) -> camera_drift.Stats:
 
 
 def find_trials_drift(
-    drift: Drift,
+    drift: NightDrift,
     limits: DriftLimits,
     loop: str,
     paths: Sequence[str],
@@ -127,7 +127,7 @@ def _classifier() -> "TrainClassifier | None":
 
 
 def find_prints_drift(
-    drift: Drift,
+    drift: NightDrift,
     limits: DriftLimits,
     loop: str,
     folder: str,
@@ -182,7 +182,7 @@ def _unreadable(path: str, settings: "TrainClassifier") -> str:
 
 
 def add_alarms(
-    drift: Drift,
+    drift: NightDrift,
     limits: DriftLimits,
     loop: str,
     path: str,

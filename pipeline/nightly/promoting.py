@@ -33,7 +33,7 @@ CERTIFIED = (f"{EXPORTED}/controller.json", f"{EXPORTED}/arrays.safetensors", CE
 
 
 # what was decided of a loop's challenger, and what the judge measured of it, if it was measured
-JudgedLoop = tuple[LoopDecision, dict[str, Any] | None]
+JudgedLoop = tuple[LoopDecision, Mapping[str, Any] | None]
 
 
 def judge_all(

@@ -69,7 +69,7 @@ def sort_alarms(alarms: Sequence[Alarm]) -> list[Alarm]:
 
 
 @dataclasses.dataclass
-class Drift:
+class NightDrift:
     """What new recordings say of the machines and cameras: alarms, what would be one if it stayed, and why
     recordings were set aside; notes.
 
@@ -198,7 +198,7 @@ class Night:
     notes: list[str] = dataclasses.field(default_factory=list)
     new_recordings: dict[str, list[str]] = dataclasses.field(default_factory=dict)
     used: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
-    drift: Drift = dataclasses.field(default_factory=Drift)
+    drift: NightDrift = dataclasses.field(default_factory=NightDrift)
     decisions: dict[str, LoopDecision] = dataclasses.field(default_factory=dict)
     commit: str = ""
     unpushed: bool = False

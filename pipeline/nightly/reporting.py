@@ -54,15 +54,12 @@ def report(night: Night, memory: Memory, settings: Nightly | None, render: Rende
             troubles.append(tell(error, night.run))
             return False
 
-    def write_page() -> None:
-        night.notes += troubles
-        text = render(memory.nights, champion.read(), watch.hide_secrets(settings))
-        artifacts.write_text(PAGE, text)
-
     memory.nights.append(night)
     attempt(lambda: remembered.write(memory))
     made = night.outcome == records.NOTHING_NEW and PAGE.exists()
-    if not made and not (settings and attempt(write_page)):
+    if not made and not (
+        settings and attempt(lambda: _write_page(night, troubles, memory, settings, render))
+    ):
         attempt(lambda: artifacts.write_text(PAGE, render_plainly(night, troubles)))
     status = FAILED if troubles else exit_status(night)
     routes = watch.find_routes(settings)
@@ -73,6 +70,13 @@ def report(night: Night, memory: Memory, settings: Nightly | None, render: Rende
         details = {"drift": to_json(night.drift), "log": f".beadline/logs/{night.run}.log"}
         troubles += watch.wake(kind, reasons, _details(night, status) | details, routes)
     return status, summarise(night, troubles)
+
+
+def _write_page(
+    night: Night, troubles: Sequence[str], memory: Memory, settings: Nightly, render: Render
+) -> None:
+    night.notes += troubles
+    artifacts.write_text(PAGE, render(memory.nights, champion.read(), watch.hide_secrets(settings)))
 
 
 def _details(night: Night, status: int) -> dict[str, str | int]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.nightly import champion, pictures, temperature_drift
-from pipeline.nightly.records import SENSOR, Drift, Memory, sort_alarms
+from pipeline.nightly.records import SENSOR, Memory, NightDrift, sort_alarms
 from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.nightly.temperature_drift import REFERENCE
 from pipeline.store import artifacts, params
@@ -14,11 +14,11 @@ from pipeline.store import artifacts, params
 
 def look(
     settings: Nightly, champions: Collection[str], new: Mapping[str, Sequence[str]], memory: Memory
-) -> Drift:
+) -> NightDrift:
     """New recordings {loop: paths} held against those of each loop's champion; `champions` are the loops that
     have one. `memory`, that of the night before, then has what the next night must know of this one. A loop's
     alarms say nothing of another loop. If nothing was recorded, what was found last still stands."""
-    drift = Drift()
+    drift = NightDrift()
     if not new:
         drift.alarms += memory.alarms
         return drift

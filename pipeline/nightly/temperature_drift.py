@@ -13,7 +13,7 @@ from pipeline.nightly.baseline import Baseline
 from pipeline.nightly.camera_drift import CameraChange
 from pipeline.nightly.drift import CauseFit, DriftCause, DriftRecord, Explanation, ProductionModel, Segments
 from pipeline.nightly.inputs import quarantine
-from pipeline.nightly.records import SENSOR, Alarm, Drift, Memory
+from pipeline.nightly.records import SENSOR, Alarm, Memory, NightDrift
 from pipeline.nightly.settings import DriftLimits, NightlyLoop
 from pipeline.store import artifacts, params
 from pipeline.temperature.identification import model_choice
@@ -172,7 +172,7 @@ def _samples(nights: Sequence[Segments]) -> int:
 
 
 def look(
-    found: Drift,
+    found: NightDrift,
     limits: DriftLimits,
     loop: str,
     folder: str,
@@ -218,7 +218,7 @@ def look(
 
 
 def _stand_still(
-    found: Drift,
+    found: NightDrift,
     loop: str,
     path: str,
     record: dict[str, np.ndarray],
@@ -242,13 +242,13 @@ def _stand_still(
     return True
 
 
-def _doubt(found: Drift, loop: str, path: str, output: str, sentence: str) -> None:
+def _doubt(found: NightDrift, loop: str, path: str, output: str, sentence: str) -> None:
     cause = f"{sentence} Check the sensor and its wiring before the machine heats again"
     found.alarms.append(Alarm(loop, f"{loop}: sensor {output}", path, cause, 99.9, (), SENSOR, output))
 
 
 def _hold_against(
-    found: Drift,
+    found: NightDrift,
     loop: str,
     path: str,
     record: dict[str, np.ndarray],

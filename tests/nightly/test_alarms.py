@@ -107,7 +107,7 @@ def test_stages_that_take_too_long_and_a_disk_without_room_are_told(project):
 @pytest.mark.parametrize(
     ("place", "name"),
     [(worktree, "take"), (reproducing, "reproduce"), (promoting, "judge_all"), (night.landing, "commit"),
-     (remembered, "remember")],
+     (remembered, "write")],
 )  # fmt: skip
 def test_a_mistake_of_this_program_is_told_in_a_sentence_with_its_traceback_in_the_log(
     project, monkeypatch, place, name
@@ -123,7 +123,7 @@ def test_a_mistake_of_this_program_is_told_in_a_sentence_with_its_traceback_in_t
     assert "unforeseen" in Path(".beadline/logs/night-0002.log").read_text()
     assert "unforeseen" in Path("woken.json").read_text()
     # a night that could not be remembered has promoted all the same
-    promoted = name == "remember"
+    promoted = name == "write"
     assert project.champion()["run"] == ("night-0002" if promoted else "night-0001")
 
 
@@ -249,7 +249,8 @@ def test_a_file_name_is_no_tag_mention_picture_or_emphasis_in_a_chat(tmp_path, m
 
 def test_used_shares_are_said_in_the_summary():
     used = {"datasets/raw/t/shift_12.mcap": (61.4, 2.0, 38.0), "b.csv": (100.0, 0.0, 0.0)}
-    shares = {path: reporting.records.RecordShare(*share) for path, share in used.items()}
+    keys = ("used_percent", "masked_percent", "cut_percent")
+    shares = {path: dict(zip(keys, share, strict=True)) for path, share in used.items()}
     summary = reporting.summarise(Night(1, "night-0001", "", "kept", used=shares), [])
     assert "used 61 % of shift_12.mcap, masked, cut" in summary and "used 100 % of b.csv |" in summary
 

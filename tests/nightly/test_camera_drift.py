@@ -10,7 +10,7 @@ from pipeline.nightly import camera_drift
 LIMITS = {"moved_px": 2.0, "contrast_percent": 15.0}
 
 
-def night(seed: int, **changes) -> camera_drift.FrameStats:
+def night(seed: int, **changes) -> camera_drift.Stats:
     """25 frames of a bead between 100 and 116 px wide, as the ink lies that night."""
     rng = np.random.default_rng(seed)
     camera = rendering.SimulatedCamera(rendering.NOMINAL._replace(**changes), rng)
@@ -20,7 +20,7 @@ def night(seed: int, **changes) -> camera_drift.FrameStats:
 
 
 @pytest.fixture(scope="module")
-def good() -> list[camera_drift.FrameStats]:
+def good() -> list[camera_drift.Stats]:
     return [night(k) for k in range(4)]
 
 
@@ -76,7 +76,7 @@ def test_the_balance_of_classes_moves_when_it_moves():
     np.testing.assert_allclose(balance.value - balance.reference, [100 / 3, -100 / 3, 0], atol=1e-9)
 
 
-def prints(seed: int, shares: list[float], level: float) -> tuple[np.ndarray, camera_drift.Contrast]:
+def prints(seed: int, shares: list[float], level: float) -> tuple[np.ndarray, camera_drift.Stats]:
     """Of a print of 600 frames in 30 segments of 20 that are alike:
     frames by kind, and the line's contrast."""
     rng = np.random.default_rng(seed)

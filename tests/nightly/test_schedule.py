@@ -126,7 +126,7 @@ def test_the_job_merges_what_was_pushed_meanwhile_and_remembers_the_night(hosted
     # the next machine has the memory and the champion
     clone, ended = runner.work()
     assert ended == {"pull": 0, "night": reporting.OK, "push": 0}, runner.printed
-    last = json.loads((clone.folder / ".beadline/last.json").read_text())
+    last = json.loads((clone.folder / ".beadline/memory.json").read_text())
     assert last["night"] == 3 and last["idle"] == 1
     assert clone.production()["learn/model.json"] == b"10.0"
 
