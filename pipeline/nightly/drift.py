@@ -694,17 +694,20 @@ def shift(
     before_deviation: np.ndarray,
     *,
     freedom: int = BLOCKS - 1,
+    nights: int = 0,
 ) -> Shift:
-    """value (k,) against those of the reference nights before (nights, k): their mean, and as noise both
-    nights' own and what they scatter beyond it (DerSimonian and Laird 1986).
+    """value (k,) against those of the reference nights before (rows, k): their mean, and as noise both
+    nights' own and what they scatter beyond it (DerSimonian and Laird 1986). `nights` is how many of the rows
+    are independent, 0 if all are.
 
     A night's own deviation has `freedom`, the scatter of a few nights less: both count with the
     degrees of freedom that they have (Satterthwaite 1946), and the ratio is brought to the sigmas
     that a normal variable would need to be as unlikely.
     """
-    nights = len(before)
+    nights = nights or len(before)
     inside = (before_deviation**2).mean(axis=0)
-    between = np.maximum(before.var(axis=0, ddof=1) - inside, 0.0) if nights > 1 else np.zeros_like(inside)
+    scattered = before.var(axis=0) * nights / max(nights - 1, 1)
+    between = np.maximum(scattered - inside, 0.0) if nights > 1 else np.zeros_like(inside)
     own, scatter = np.maximum(deviation**2 + inside / nights, 1e-24), between * (1 + 1 / nights)
     spread = np.sqrt(own + scatter)
     t = (value - before.mean(axis=0)) / spread

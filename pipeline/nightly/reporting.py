@@ -67,7 +67,11 @@ def report(night: Night, memory: Memory, settings: Nightly | None, render: Rende
         troubles += watch.beat(routes)
     if status != OK:
         kind, reasons = _alarm(night, status, troubles)
-        details = {"drift": to_json(night.drift), "log": f".beadline/logs/{night.run}.log"}
+        details = {
+            "drift": to_json(night.drift),
+            "quarantined": night.drift.quarantined,
+            "log": f".beadline/logs/{night.run}.log",
+        }
         troubles += watch.wake(kind, reasons, _details(night, status) | details, routes)
     return status, summarise(night, troubles)
 

@@ -397,7 +397,7 @@ def _size(fit: CauseFit, held: ProductionReference, segments: Segments = ()) -> 
     at = drift.causes(held.machine.plant).index(cause)
     among = drift.shift(
         np.array([value]), np.array([deviation]),
-        held.own.values[:, [at]], held.own.deviations[:, [at]],
+        held.own.values[:, [at]], held.own.deviations[:, [at]], nights=len(held.own.noise),
     )  # fmt: skip
     moved, deviation = float(among.value[0] - among.reference[0]), float(among.deviation[0])
     if cause.kind == "gain":

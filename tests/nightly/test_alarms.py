@@ -15,7 +15,7 @@ from pipeline.cli import render_night
 from pipeline.nightly import night, promoting, remembered, reporting, reproducing, watch, worktree
 from pipeline.nightly.records import Night
 from pipeline.nightly.settings import Nightly
-from tests.nightly.toy_nights import SETTINGS, Project, entered
+from tests.nightly.toy_nights import SETTINGS, Project
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +26,6 @@ def first(tmp_path_factory):
     (project.folder / ".gitignore").write_text("/reports/*.html\n/woken.json\n")
     project.run("git", "commit", "-qam", "an alarm")
     return project.promoted()
-
-
-@pytest.fixture
-def project(first, tmp_path, monkeypatch):
-    return entered(first, tmp_path / "toy", monkeypatch)
 
 
 @pytest.fixture

@@ -54,7 +54,7 @@ def test_a_change_is_named_and_found_in_two_nights(good, changes, key):
 
 def test_the_line_s_place_is_read_to_a_tenth_of_a_pixel(good):
     moved = night(60, offset_px=rendering.NOMINAL.offset_px + 4)
-    assert moved.mean[0] - np.mean([stats.mean[0] for stats in good]) == pytest.approx(
+    assert moved[0][0] - np.mean([median[0] for median, _ in good]) == pytest.approx(
         4, abs=0.3
     )  # the bead's own wander is 0.2 px
 

@@ -49,17 +49,6 @@ pathlib.Path("datasets/pages.txt").write_text(" ".join(costs))
 """
 
 
-@pytest.fixture(scope="module")
-def first(tmp_path_factory):
-    """The project after its first night."""
-    return Project(tmp_path_factory.mktemp("nights") / "toy").make().promoted()
-
-
-@pytest.fixture
-def project(first, tmp_path, monkeypatch):
-    return entered(first, tmp_path / "toy", monkeypatch)
-
-
 def run(status: int = reporting.OK) -> str:
     """The summary of a night that ends with this status, and leaves nothing on its table."""
     ended, summary = night.nightly(render_night)

@@ -13,17 +13,7 @@ from pipeline.recordings import excluded
 from pipeline.store import artifacts, params
 from pipeline.verdict import verdict
 from tests.conftest import ROOT
-from tests.nightly.toy_nights import SETTINGS, Project, entered
-
-
-@pytest.fixture(scope="module")
-def first(tmp_path_factory):
-    return Project(tmp_path_factory.mktemp("production") / "toy").make().promoted()
-
-
-@pytest.fixture
-def project(first, tmp_path, monkeypatch):
-    return entered(first, tmp_path / "toy", monkeypatch)
+from tests.nightly.toy_nights import SETTINGS, Project
 
 
 def put(state: ChampionState, run: str, loop: str = "toy", event: str = "promoted") -> ChampionState:

@@ -13,18 +13,7 @@ from pipeline.nightly import by_hand, champion, inputs, night, reporting, worktr
 from pipeline.nightly import screening as screens
 from pipeline.nightly.records import NightDrift
 from tests.nightly.test_nights_in_a_copy import during_the_stages, learned, run
-from tests.nightly.toy_nights import Project, entered
-
-
-@pytest.fixture(scope="module")
-def first(tmp_path_factory):
-    """The project after its first night."""
-    return Project(tmp_path_factory.mktemp("strange") / "toy").make().promoted()
-
-
-@pytest.fixture
-def project(first, tmp_path, monkeypatch):
-    return entered(first, tmp_path / "toy", monkeypatch)
+from tests.nightly.toy_nights import Project
 
 
 def observe(project: Project) -> tuple:
