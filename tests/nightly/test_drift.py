@@ -178,6 +178,19 @@ def test_a_baseline_takes_up_what_its_own_records_hold_to_be_otherwise(machine):
     assert fit.cause == drift.DriftCause("gain", 0) and fit.value == pytest.approx(1 / 0.9 - 1, abs=0.01)
 
 
+def test_what_the_champions_own_model_gets_wrong_of_its_nights_is_no_change_of_a_later_one(machine):
+    """The models that are identified without a night may get it right where the champion's own does not."""
+    honest = two_zones(gain=(0.985, 1.0))
+    right = drift.ProductionModel(honest._replace(K=robust_observer_gain(honest, 1.0)), SAMPLES)
+    nights = [[record(honest, 940 + k)] for k in range(4)]
+    floors = baseline.Floors(0.03, 0.25)
+    blind = baseline.measured(machine, nights, floors, [right] * 4)
+    gain = CAUSES.index(drift.DriftCause("gain", 0))
+    np.testing.assert_allclose(blind.values[:, gain], [0.0] * 4 + [-0.015] * 4, atol=0.006)
+    for seed in (50, 51):
+        assert explained(machine, blind, record(honest, seed))[1].named == []
+
+
 def test_a_baseline_comes_back_from_its_file(own):
     again = Baseline.read(own.to_json())
     for name in ("scale", "changes"):
