@@ -30,11 +30,12 @@ Undo = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Mistake(NamedTuple):
-    """What is wrong with a record in words, the record with that undone, and by how much its mean squared
-    error falls."""
+    """What is wrong with a record in words, the record with that undone, the mean squared error that it then
+    leaves, and how many times that was larger."""
 
     words: str
     undone: Segments
+    left: float
     better: float
 
     @property
@@ -61,13 +62,12 @@ def found(
     if as_is < BETTER:
         return None
     mistake = likeliest(machine, segments, own, inputs=inputs, outputs=outputs)
-    left = as_is / mistake.better
-    if left > honest(own) or mistake.better < BETTER:
+    if mistake.left > honest(own) or mistake.better < BETTER:
         return None
     samples = sum(int(one.measured.sum()) for one in asked.segments)
     every_delay = drift.DriftCause("delay", -1)  # which is a shifted clock by another name
     explained = [fit.explained for fit in drift.alone(asked, own.changes) if fit.cause != every_delay]
-    return None if as_is - max(explained) / samples < AS_MUCH * left else mistake
+    return None if as_is - max(explained) / samples < AS_MUCH * mistake.left else mistake
 
 
 def honest(own: Baseline) -> float:
@@ -84,7 +84,8 @@ def likeliest(
     outputs: Sequence[str],
 ) -> Mistake:
     """Of all mistakes the one that explains the record best with it undone, be that well or not; mistakes
-    that explain as much are named with it. Raises ValueError if the record is too short."""
+    that explain as much are named with it. Errors are compared as large as they were recorded: sensors that
+    are scaled down err less for that alone. Raises ValueError if the record is too short."""
     as_is = baseline.misfit(drift.record(machine, segments, own.scale, ROOM), own.changes)
 
     def left(undone: Segments) -> float:
@@ -94,22 +95,28 @@ def likeliest(
             return np.inf
 
     tried = []
-    for words, undo in (*_swaps(inputs, outputs), *_units(inputs, outputs)):
+    for words, undo, scale in (*_swaps(inputs, outputs), *_units(inputs, outputs)):
         undone = [undo(u, y) for u, y in segments]
-        tried.append((left(undone), words, undone))
-    tried.append(_clock(segments, left, machine.plant.sample_time_s))
-    (least, words, undone), *others = sorted(tried, key=lambda one: one[0])
-    as_good = [other for cost, other, _ in others[:2] if cost < ALIKE * least]
-    return Mistake(", or ".join([words, *as_good]), undone, as_is / least)
+        rest = left(undone)
+        tried.append((rest / scale**2, rest, words, undone))
+    rest, words, undone = _clock(segments, left, machine.plant.sample_time_s)
+    tried.append((rest, rest, words, undone))
+    (least, rest, words, undone), *others = sorted(tried, key=lambda one: one[0])
+    as_good = [
+        other
+        for cost, remainder, other, _ in others[:2]
+        if cost < ALIKE * least and remainder < (as_is + rest) / 2
+    ]
+    return Mistake(", or ".join([words, *as_good]), undone, rest, as_is / rest)
 
 
-def _swaps(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo]]:
+def _swaps(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo, float]]:
     for j, i in itertools.combinations(range(len(outputs)), 2):
         words = f"the sensors {outputs[j]} and {outputs[i]} are swapped"
-        yield words, lambda u, y, at=(i, j): (u, _swapped(y, at))
+        yield words, lambda u, y, at=(i, j): (u, _swapped(y, at)), 1.0
     for j, i in itertools.combinations(range(len(inputs)), 2):
         words = f"the inputs {inputs[j]} and {inputs[i]} are swapped"
-        yield words, lambda u, y, at=(i, j): (_swapped(u, at), y)
+        yield words, lambda u, y, at=(i, j): (_swapped(u, at), y), 1.0
 
 
 def _swapped(values: np.ndarray, at: tuple[int, int]) -> np.ndarray:
@@ -118,8 +125,9 @@ def _swapped(values: np.ndarray, at: tuple[int, int]) -> np.ndarray:
     return values
 
 
-def _units(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo]]:
-    """Wrong units and factors, of every signal and of each."""
+def _units(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo, float]]:
+    """Wrong units and factors, of every signal and of each; last the factor by which undoing it scales the
+    outputs' errors, their geometric mean."""
     every = slice(None)
     sensors = (
         ("in °F where °C is declared", 1 / 1.8, -32 / 1.8),
@@ -136,11 +144,12 @@ def _units(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str,
     for at, name in ((every, "every sensor"), *enumerate(outputs)):
         for unit, factor, offset in sensors:
             change = (at, factor, offset)
-            yield f"{name} is {unit}", lambda u, y, change=change: (u, _scaled(y, *change))
+            scale = factor if at == every else factor ** (1 / len(outputs))
+            yield f"{name} is {unit}", lambda u, y, change=change: (u, _scaled(y, *change)), scale
     for at, name in ((every, "every input"), *enumerate(inputs)):
         for unit, factor in heaters:
             change = (at, factor, 0.0)
-            yield f"{name} is {unit}", lambda u, y, change=change: (_scaled(u, *change), y)
+            yield f"{name} is {unit}", lambda u, y, change=change: (_scaled(u, *change), y), 1.0
 
 
 def _scaled(values: np.ndarray, at: int | slice, factor: float, offset: float) -> np.ndarray:

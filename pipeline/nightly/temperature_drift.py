@@ -127,10 +127,10 @@ def _without_each(machine: Plant, nights: Sequence[Segments]) -> list[Production
     for fold in range(folds):
         others = [pair for k, night in enumerate(nights) if k % folds != fold for pair in night]
         u, y = [pair[0] for pair in others], [pair[1] for pair in others]
-        found = model_choice.identify(
+        model = model_choice.identify(
             u, y, sample_time_s=machine.sample_time_s, settings=settings, names=names
         )
-        models.append(ProductionModel(found.plant, _samples(nights)))
+        models.append(ProductionModel(model.plant, _samples(nights)))
     return [models[k % folds] for k in range(len(nights))]
 
 
@@ -172,7 +172,7 @@ def _samples(nights: Sequence[Segments]) -> int:
 
 
 def look(
-    found: NightDrift,
+    findings: NightDrift,
     limits: DriftLimits,
     loop: str,
     folder: str,
@@ -180,9 +180,9 @@ def look(
     champion: Path | None,
     memory: Memory,
 ) -> dict[str, Any]:
-    """Adds to `found` what the new recordings below `folder` say of the loop's machine, held against those of
-    its champion; what the next night must remember of this one (see `Memory.recent`). A recording that cannot
-    be read, or is not what it says, is set aside."""
+    """Adds to `findings` what the new recordings below `folder` say of the loop's machine, held against those
+    of its champion; what the next night must remember of this one (see `Memory.recent`). A recording that
+    cannot be read, or is not what it says, is set aside."""
     recent = memory.recent.get(loop, {})
     if not Path(folder).is_dir():
         return recent
@@ -194,104 +194,113 @@ def look(
         if within in broken:
             for output in machine.outputs:
                 if f"should hold numbers for {output.name} but all of its" in broken[within]:
-                    _doubt(found, loop, path, output.name, f"{output.name} gives no number.")
-            found.quarantined[path] = quarantine(path, loop, broken[within])
+                    _doubt(findings, loop, path, output.name, f"{output.name} gives no number.")
+            findings.quarantined[path] = quarantine(path, loop, broken[within])
         elif within in records:
             good[path] = records[within].record
     if champion is None or not good:
         return recent
-    held = read_reference(champion, machine, limits)
-    if held is None:
-        found.notes.append(
+    production = read_reference(champion, machine, limits)
+    if production is None:
+        findings.notes.append(
             f"{loop}: the champion has no reference of its own recordings that this version reads: drift was "
             "not measured; the next promotion makes one"
         )
         return recent
-    nights = list(recent["nights"]) if recent.get("reference") == held.digest else []
+    nights = list(recent["nights"]) if recent.get("reference") == production.digest else []
     for path, record in good.items():
         try:
-            if not _stand_still(found, loop, path, record, held, machine):
-                _hold_against(found, loop, path, record, held, machine, nights, memory.pending)
+            if not _stand_still(findings, loop, path, record, production, machine):
+                _hold_against(findings, loop, path, record, production, machine, nights, memory.pending)
         except ValueError as error:
-            found.notes.append(f"{path}: {error}")
-    return {"reference": held.digest, "nights": nights}
+            findings.notes.append(f"{path}: {error}")
+    return {"reference": production.digest, "nights": nights}
 
 
 def _stand_still(
-    found: NightDrift,
+    findings: NightDrift,
     loop: str,
     path: str,
     record: dict[str, np.ndarray],
-    held: ProductionReference,
+    production: ProductionReference,
     machine: Plant,
 ) -> bool:
     """Whether a sensor gives no number or stands still in a recording: then that is an alarm, the recording
-    is set aside, and nothing else is asked of it. Readings in °F or K are out of limits as well: no alarm."""
+    is set aside, and nothing else is asked of it. Readings in °F or K are out of limits as well: if they are
+    within them with that undone, and fit the model, it is a mistake of the record and no alarm."""
     readings = _last(judge.segments(record, machine, masked=False))
-    noise = np.exp(held.own.noise.mean(axis=0) / 2)
-    faults = sensors.faults(held.machine.plant, machine, readings, noise=noise, steps=held.steps)
+    noise = np.exp(production.own.noise.mean(axis=0) / 2)
+    plant, steps = production.machine.plant, production.steps
+    faults = sensors.faults(plant, machine, readings, noise=noise, steps=steps)
     if not faults:
         return False
-    mistake = None
+    reason = f"{faults[0].sentence} It says nothing of the machine"
     if all(fault.kind == sensors.OPEN for fault in faults):
-        mistake = mistakes.found(held.machine, readings, held.own, inputs=held.inputs, outputs=held.outputs)
-    for fault in [] if mistake else faults:
-        _doubt(found, loop, path, fault.output, fault.sentence)
-    reason = mistake.reason if mistake else f"{faults[0].sentence} It says nothing of the machine"
-    found.quarantined[path] = quarantine(path, loop, f"{path}: {reason}")
+        mistake = mistakes.likeliest(
+            production.machine, readings, production.own, inputs=production.inputs, outputs=production.outputs
+        )
+        fits = mistake.left <= mistakes.honest(production.own)
+        if fits and not sensors.faults(plant, machine, mistake.undone, noise=noise, steps=steps):
+            reason = f"{mistake.words}: undone, the readings are within their limits; mend it and put it back"
+            faults = []
+    for fault in faults:
+        _doubt(findings, loop, path, fault.output, fault.sentence)
+    findings.quarantined[path] = quarantine(path, loop, f"{path}: {reason}")
     return True
 
 
-def _doubt(found: NightDrift, loop: str, path: str, output: str, sentence: str) -> None:
+def _doubt(findings: NightDrift, loop: str, path: str, output: str, sentence: str) -> None:
     cause = f"{sentence} Check the sensor and its wiring before the machine heats again"
-    found.alarms.append(Alarm(loop, f"{loop}: sensor {output}", path, cause, 99.9, (), SENSOR, output))
+    findings.alarms.append(Alarm(loop, f"{loop}: sensor {output}", path, cause, 99.9, (), SENSOR, output))
 
 
 def _hold_against(
-    found: NightDrift,
+    findings: NightDrift,
     loop: str,
     path: str,
     record: dict[str, np.ndarray],
-    held: ProductionReference,
+    production: ProductionReference,
     machine: Plant,
     nights: list[dict[str, list[float]]],
     pending: Sequence[str],
 ) -> None:
-    """Adds what one recording says of the machine to what was found; its changes join those of `nights`."""
+    """Adds what one recording says of the machine to the findings; its changes join those of `nights`."""
     segments, closed_loop = _last(judge.segments(record, machine)), _closed_loop(record, machine)
     if not segments:
         return
-    mistake = mistakes.found(held.machine, segments, held.own, inputs=held.inputs, outputs=held.outputs)
+    mistake = mistakes.found(
+        production.machine, segments, production.own, inputs=production.inputs, outputs=production.outputs
+    )
     if mistake:
-        found.quarantined[path] = quarantine(path, loop, f"{path}: {mistake.reason}")
+        findings.quarantined[path] = quarantine(path, loop, f"{path}: {mistake.reason}")
         segments, closed_loop = mistake.undone, {}
-    measured = _measure(segments, held, closed_loop)
+    measured = _measure(segments, production, closed_loop)
     changes = measured.changes
-    if not mistake and (doubt := _find_doubt(measured, segments, held)):
+    if not mistake and (doubt := _find_doubt(measured, segments, production)):
         words, wrong = doubt
         if wrong:
-            found.quarantined[path] = quarantine(path, loop, f"{path}: {words}")
+            findings.quarantined[path] = quarantine(path, loop, f"{path}: {words}")
             return
         if not changes:
-            found.notes.append(f"{path}: {words}, and no single change explains it")
+            findings.notes.append(f"{path}: {words}, and no single change explains it")
         changes = [change._replace(words=f"{change.words}; or {words}") for change in changes]
-    found.figures[path] = measured.figures
-    found.notes.append(f"{Path(path).name} would have shown {measured.figures['least']}")
+    findings.figures[path] = measured.figures
+    findings.notes.append(f"{Path(path).name} would have shown {measured.figures['least']}")
     nights.append({one.key: [round(one.size, 6), round(one.deviation, 6)] for one in changes})
     del nights[:-POOLED]
     consequences, quiet = tuple(cause.words for cause in measured.loop), True
     for change in changes:
         sure = past_limit([night.get(change.key) for night in nights], change.limit)
-        if abs(change.size) >= change.limit or sure >= held.limits.limit_sigmas:
+        if abs(change.size) >= change.limit or sure >= production.limits.limit_sigmas:
             sigmas = float(np.clip(change.size / max(change.deviation, 1e-9), -999.0, 999.0))
             alarm = Alarm(
                 loop, f"{loop}: {change.key}", path, change.words, round(sigmas, 1), consequences,
                 change.kind, change.channel,
             )  # fmt: skip
-            (found.alarms if sure >= held.limits.limit_sigmas else found.watched).append(alarm)
+            (findings.alarms if sure >= production.limits.limit_sigmas else findings.watched).append(alarm)
             quiet = False
     if quiet:
-        pictures.add_alarms(found, held.limits, loop, path, measured.loop, pending)
+        pictures.add_alarms(findings, production.limits, loop, path, measured.loop, pending)
 
 
 def past_limit(estimates: Sequence[Sequence[float] | None], limit: float) -> float:
@@ -323,31 +332,35 @@ class RecordingDrift(NamedTuple):
 
 
 def _measure(
-    segments: Segments, held: ProductionReference, closed_loop: Mapping[str, list[list[float]]]
+    segments: Segments, production: ProductionReference, closed_loop: Mapping[str, list[list[float]]]
 ) -> RecordingDrift:
-    own = held.own
+    own = production.own
     record, explained = drift.explain_segments(
-        held.machine, segments, own.scale, own.changes, own.usual(drift.causes(held.machine.plant))
+        production.machine,
+        segments,
+        own.scale,
+        own.changes,
+        own.usual(drift.causes(production.machine.plant)),
     )
     changes = [
-        _join_rivals([_say(held, fit, segments) for fit in (named.fit, *named.rivals)])
+        _join_rivals([_say(production, fit, segments) for fit in (named.fit, *named.rivals)])
         for named in explained.named
     ]
     air = drift.levels(record, explained.changes)[0]
-    if abs(air) > held.limits.ambient_degC:
-        changes.append(_say_air(held, air, record))
+    if abs(air) > production.limits.ambient_degC:
+        changes.append(_say_air(production, air, record))
     effect = drift.moved(record, own.changes, explained.changes) + abs(air)
-    figures, loop, not_applicable = _compare_loop(closed_loop, held, effect, unchanged=not changes)
-    innovation, louder = _compare_noise(record, explained, held)
+    figures, loop, not_applicable = _compare_loop(closed_loop, production, effect, unchanged=not changes)
+    innovation, louder = _compare_noise(record, explained, production)
     fits = [*explained.others, *(named.fit for named in explained.named)]
     samples = sum(int(one.measured.sum()) for one in record.segments)
     return RecordingDrift(
         {
-            "parameters": _tell_parameters(fits, held),
+            "parameters": _tell_parameters(fits, production),
             "innovation": innovation,
             "closed_loop": figures,
             "not_applicable": not_applicable,
-            "least": _tell_least(fits, held),
+            "least": _tell_least(fits, production),
         },
         [*changes, *louder],
         loop,
@@ -356,16 +369,18 @@ def _measure(
 
 
 def _find_doubt(
-    measured: RecordingDrift, segments: Segments, held: ProductionReference
+    measured: RecordingDrift, segments: Segments, production: ProductionReference
 ) -> tuple[str, bool] | None:
     """Why a record may not be of this machine, in words, and whether it is set aside; None if the causes that
     were named can be, and explain the record. A heater that is dead looks like commands that are written too
     large: a gain that fell is told with the mistake beside it."""
     impossible = [change for change in measured.changes if cannot_be(change.kind, change.size)]
-    unexplained = measured.misfit > UNEXPLAINED * mistakes.honest(held.own)
+    unexplained = measured.misfit > UNEXPLAINED * mistakes.honest(production.own)
     if not impossible and not unexplained and len(measured.changes) < drift.MOST:
         return None
-    likeliest = mistakes.likeliest(held.machine, segments, held.own, inputs=held.inputs, outputs=held.outputs)
+    likeliest = mistakes.likeliest(
+        production.machine, segments, production.own, inputs=production.inputs, outputs=production.outputs
+    )
     words = "this record does not fit the machine"
     if likeliest.better >= WORTH_NAMING:
         words += (
@@ -383,21 +398,21 @@ def cannot_be(kind: str, size: float) -> bool:
     return abs(size) > {"gain": MOST_GAIN_PERCENT, "offset": MOST_OFFSET_DEGC}.get(kind, np.inf)
 
 
-def _name(cause: DriftCause, held: ProductionReference) -> str:
-    of = held.outputs if cause.kind in ("offset", "late sensor") else held.inputs
+def _name(cause: DriftCause, production: ProductionReference) -> str:
+    of = production.outputs if cause.kind in ("offset", "late sensor") else production.inputs
     return of[cause.channel] if cause.channel >= 0 else "every input"
 
 
-def _size(fit: CauseFit, held: ProductionReference, segments: Segments = ()) -> tuple[float, float]:
+def _size(fit: CauseFit, production: ProductionReference, segments: Segments = ()) -> tuple[float, float]:
     """A fit and its standard deviation in the unit of its limit: percent, s, °C, or percent of the record."""
     cause, value, deviation = fit.cause, fit.value, fit.deviation
     if cause.kind == "saturation":
         least, most = (drift.above(segments, cause.channel, value + side * deviation) for side in (1, -1))
         return drift.above(segments, cause.channel, value), max((most - least) / 2, 0.5)
-    at = drift.causes(held.machine.plant).index(cause)
+    at = drift.causes(production.machine.plant).index(cause)
     among = drift.shift(
         np.array([value]), np.array([deviation]),
-        held.own.values[:, [at]], held.own.deviations[:, [at]], nights=len(held.own.noise),
+        production.own.values[:, [at]], production.own.deviations[:, [at]], nights=len(production.own.noise),
     )  # fmt: skip
     moved, deviation = float(among.value[0] - among.reference[0]), float(among.deviation[0])
     if cause.kind == "gain":
@@ -405,7 +420,7 @@ def _size(fit: CauseFit, held: ProductionReference, segments: Segments = ()) -> 
     if cause.kind == "time constant":
         longer = 1 / (1 + max(moved, -0.9))
         return 100 * (longer - 1), 100 * deviation * longer**2
-    step = held.machine.plant.sample_time_s if cause.kind in ("delay", "late sensor") else 1.0
+    step = production.machine.plant.sample_time_s if cause.kind in ("delay", "late sensor") else 1.0
     return moved * step, deviation * step
 
 
@@ -417,9 +432,9 @@ def _limit(limits: DriftLimits, cause: DriftCause) -> float:
     }[cause.kind]  # fmt: skip
 
 
-def _say(held: ProductionReference, fit: CauseFit, segments: Segments) -> RecordingChange:
-    cause, name = fit.cause, _name(fit.cause, held)
-    size, deviation = _size(fit, held, segments)
+def _say(production: ProductionReference, fit: CauseFit, segments: Segments) -> RecordingChange:
+    cause, name = fit.cause, _name(fit.cause, production)
+    size, deviation = _size(fit, production, segments)
     verb, when = ("reads" if cause.kind == "late sensor" else "acts"), ("later" if size > 0 else "earlier")
     clock = ", or the clock of the outputs is off against that of the inputs" if cause.channel < 0 else ""
     late = f"{name} {verb} {abs(size):.1f} s {when} than it did{clock}"
@@ -434,7 +449,7 @@ def _say(held: ProductionReference, fit: CauseFit, segments: Segments) -> Record
         "late sensor": late,
     }[cause.kind]
     kind = "delay" if cause.kind == "late sensor" else cause.kind
-    return RecordingChange(kind, name, words, size, deviation, _limit(held.limits, cause))
+    return RecordingChange(kind, name, words, size, deviation, _limit(production.limits, cause))
 
 
 def _join_rivals(rivals: Sequence[RecordingChange]) -> RecordingChange:
@@ -449,28 +464,28 @@ def _join_rivals(rivals: Sequence[RecordingChange]) -> RecordingChange:
     return first._replace(kind=" or ".join(kinds), words=", or ".join(one.words for one in rivals) + rest)
 
 
-def _say_air(held: ProductionReference, air: float, record: DriftRecord) -> RecordingChange:
+def _say_air(production: ProductionReference, air: float, record: DriftRecord) -> RecordingChange:
     word = "warmer" if air > 0 else "colder"
     words = (
         f"it is {abs(air):.0f} °C {word} around the machine than on the champion's own nights, or every "
         "sensor reads so much from what it did"
     )
-    deviation = float(np.hypot(drift.air_deviation(record), held.own.scale.ambient))
-    return RecordingChange("ambient", "", words, air, deviation, held.limits.ambient_degC)
+    deviation = float(np.hypot(drift.air_deviation(record), production.own.scale.ambient))
+    return RecordingChange("ambient", "", words, air, deviation, production.limits.ambient_degC)
 
 
 def _compare_noise(
-    record: DriftRecord, explained: Explanation, held: ProductionReference
+    record: DriftRecord, explained: Explanation, production: ProductionReference
 ) -> tuple[dict[str, dict[str, float]], list[RecordingChange]]:
     """Noise of each output, and by how many degrees of its steady level it is off what the champion's nights
     had; then the noises that have changed."""
     value, deviation = baseline.noise(drift.by_output(record, explained.left))
-    noise = drift.shift(value, deviation, held.own.noise, held.own.noise_deviation)
-    air, own = drift.levels(record, held.own.changes)
-    known = np.hypot(held.own.scale.ambient, held.own.scale.level)
-    ratio, limit = np.exp(0.5 * (noise.value - noise.reference)), held.limits.noise_percent
+    noise = drift.shift(value, deviation, production.own.noise, production.own.noise_deviation)
+    air, own = drift.levels(record, production.own.changes)
+    known = np.hypot(production.own.scale.ambient, production.own.scale.level)
+    ratio, limit = np.exp(0.5 * (noise.value - noise.reference)), production.limits.noise_percent
     figures, louder = {}, []
-    for i, output in enumerate(held.outputs):
+    for i, output in enumerate(production.outputs):
         percent, sigmas, level = 100 * float(ratio[i] - 1), float(noise.sigmas[i]), float(air + own[i])
         figures[output] = {
             "noise_percent": percent, "noise_sigmas": sigmas,
@@ -485,27 +500,29 @@ def _compare_noise(
     return figures, louder
 
 
-def _tell_parameters(fits: Sequence[CauseFit], held: ProductionReference) -> dict[str, dict[str, float]]:
+def _tell_parameters(
+    fits: Sequence[CauseFit], production: ProductionReference
+) -> dict[str, dict[str, float]]:
     """{cause: change in percent, half of its 90 % band, sigmas} of gains and time constants: what was named,
     and what the others seem beside it."""
     fit_of, figures = {fit.cause: fit for fit in fits}, {}
-    for cause in drift.causes(held.machine.plant):
+    for cause in drift.causes(production.machine.plant):
         if cause.kind in ("gain", "time constant"):
-            percent, deviation = _size(fit_of[cause], held)
-            name = f"{cause.kind} from {_name(cause, held).replace('every input', 'all inputs')}"
+            percent, deviation = _size(fit_of[cause], production)
+            name = f"{cause.kind} from {_name(cause, production).replace('every input', 'all inputs')}"
             sigmas = percent / max(deviation, 1e-9)
             figures[name] = {"percent": percent, "band_percent": 1.645 * deviation, "sigmas": sigmas}
     return figures
 
 
-def _tell_least(fits: Sequence[CauseFit], held: ProductionReference) -> str:
+def _tell_least(fits: Sequence[CauseFit], production: ProductionReference) -> str:
     """The smallest changes of a gain and of an offset that would have been an alarm tonight, of the signal
     that is known least."""
     words = []
     for article, kind, unit in (("a", "gain", "%"), ("an", "offset", "°C")):
         sizes = {
-            _name(fit.cause, held): _limit(held.limits, fit.cause)
-            + held.limits.limit_sigmas * _size(fit, held)[1]
+            _name(fit.cause, production): _limit(production.limits, fit.cause)
+            + production.limits.limit_sigmas * _size(fit, production)[1]
             for fit in fits
             if fit.cause.kind == kind and fit.cause.channel >= 0
         }
@@ -573,13 +590,17 @@ def _mean(values: np.ndarray) -> list[list[float]]:
 
 
 def _compare_loop(
-    now: Mapping[str, list[list[float]]], held: ProductionReference, effect: np.ndarray, *, unchanged: bool
+    now: Mapping[str, list[list[float]]],
+    production: ProductionReference,
+    effect: np.ndarray,
+    *,
+    unchanged: bool,
 ) -> tuple[dict[str, dict[str, float]], list[CameraChange], str]:
     """Offset, effort and share at limits against the champion's own nights: figures by name, what has
     changed, and why it was not asked, if it was not. `effect` (p,) are the °C that the changes of the machine
     and the air around bring: what they explain is not counted again; `unchanged`: the machine is as it
     was."""
-    limits, nights = held.limits, [night for night in held.loop if night]
+    limits, nights = production.limits, [night for night in production.loop if night]
     if not now or not nights:
         return {}, [], "no stretch is settled at a set-point"
     usual = {key: np.array([night[key] for night in nights]) for key in now}
@@ -589,7 +610,7 @@ def _compare_loop(
         return {}, [], "the champion's own recordings are not of a loop settled at the references"
     aims = usual["set_point_degC"][:, 0]
     elsewhere = np.abs(now["set_point_degC"][0] - aims).min(axis=0).max() > limits.offset_degC
-    plant = held.machine.plant
+    plant = production.machine.plant
     steady = np.abs(plant.C @ np.linalg.solve(np.eye(plant.n) - plant.A, plant.B) + plant.D)
     strongest = steady.argmax(axis=0)
     points = effect[strongest] / np.maximum(steady[strongest, np.arange(plant.m)], 1e-9)
@@ -606,7 +627,7 @@ def _compare_loop(
         if elsewhere and key != "offset_degC":  # other set-points take other duties
             continue
         moved = _shift_loop(now[key], usual[key], least)
-        for k, name in enumerate(held.outputs if key == "offset_degC" else held.inputs):
+        for k, name in enumerate(production.outputs if key == "offset_degC" else production.inputs):
             by, sigmas = float(moved.value[k] - moved.reference[k]), float(moved.sigmas[k])
             figures[f"{name} {key}"] = {"moved": by, "sigmas": sigmas}
             beyond = abs(by) - least - (allowed[k] if unchanged else 0.0)

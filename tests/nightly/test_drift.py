@@ -287,6 +287,13 @@ def test_a_drifted_machine_is_no_mistake_of_the_record(machine, own, truth, spoi
         assert mistakes.found(machine, [record(truth, seed, **spoilt)], own, **SIGNALS) is None
 
 
+def test_sensors_that_are_scaled_down_explain_no_more_for_erring_less(machine, own):
+    u, y = record(two_zones(), 5)
+    likeliest = mistakes.likeliest(machine, [(u / 10, y)], own, **SIGNALS)
+    assert likeliest.words == "every input is written 10 times too small"
+    assert likeliest.left < mistakes.honest(own)
+
+
 def test_a_record_that_is_wrong_in_two_ways_is_not_put_down_to_one(machine, own):
     """What is left with one undone is no honest record: it is not set aside for that one."""
     u, y = record(two_zones(), 9)
