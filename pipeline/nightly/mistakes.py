@@ -21,9 +21,8 @@ BETTER = 30.0  # by which the mean squared error must fall
 HONEST = 2.0  # of the largest of the champion's own records: what an honest one may leave
 AS_MUCH = 2.0  # a change of the machine that leaves up to so much more explains as much
 ROOM = drift.RESTLESS._replace(another_season=False)  # the air is not 48 °C warmer: that is °F
-ALIKE = (
-    2.0  # what is left with two mistakes undone that a record does not tell apart: heaters / 10, sensors * 10
-)
+# what is left with two mistakes undone that a record does not tell apart: one sensor, or every one
+ALIKE = 2.0
 FARTHEST = 128  # samples by which a clock is looked for
 
 Undo = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -84,8 +83,11 @@ def likeliest(
     outputs: Sequence[str],
 ) -> Mistake:
     """Of all mistakes the one that explains the record best with it undone, be that well or not; mistakes
-    that explain as much are named with it. Errors are compared as large as they were recorded: sensors that
-    are scaled down err less for that alone. Raises ValueError if the record is too short."""
+    that explain as much are named with it. Raises ValueError if the record is too short.
+
+    Sensors that are scaled down err less for that alone: what is compared is the likelihood of the record as
+    it was written, |e|^2 / samples - 2 log scale, which takes the density of what was undone to its units.
+    """
     as_is = baseline.misfit(drift.record(machine, segments, own.scale, ROOM), own.changes)
 
     def left(undone: Segments) -> float:
@@ -98,14 +100,14 @@ def likeliest(
     for words, undo, scale in (*_swaps(inputs, outputs), *_units(inputs, outputs)):
         undone = [undo(u, y) for u, y in segments]
         rest = left(undone)
-        tried.append((rest / scale**2, rest, words, undone))
+        tried.append((rest - 2 * np.log(scale), rest, words, undone))
     rest, words, undone = _clock(segments, left, machine.plant.sample_time_s)
     tried.append((rest, rest, words, undone))
     (least, rest, words, undone), *others = sorted(tried, key=lambda one: one[0])
     as_good = [
         other
         for cost, remainder, other, _ in others[:2]
-        if cost < ALIKE * least and remainder < (as_is + rest) / 2
+        if cost < least + (ALIKE - 1) * rest and remainder < (as_is + rest) / 2
     ]
     return Mistake(", or ".join([words, *as_good]), undone, rest, as_is / rest)
 
