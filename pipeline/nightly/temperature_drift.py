@@ -35,6 +35,7 @@ SETTLED = 5.0
 FOLDS = 4  # models that are identified without some of the champion's nights
 # no machine changes by more within a night: then the record is in doubt
 MOST_GAIN_PERCENT, MOST_OFFSET_DEGC = 80.0, 50.0
+FELL_PERCENT = -60.0  # a heater that gives so much less looks like commands that are written too large
 ROOM_DEGC, COLDEST_DEGC, HOTTEST_DEGC = 20.0, -30.0, 60.0  # of the champion's nights; of any room
 UNEXPLAINED = 3.0  # by so much more than an honest record may leave, a record leaves what no cause explains
 LIKELY, WORTH_NAMING = 4.0, 1.5  # times that a record fits better with a mistake undone
@@ -386,7 +387,8 @@ def _find_doubt(
         words += (
             f": likeliest mistake: {likeliest.words}; undone, it fits {likeliest.better:.0f} times better"
         )
-    fell = [change for change in impossible if change.kind.startswith("gain") and change.size < 0]
+    gains = [change.size for change in measured.changes if change.kind.startswith("gain")]
+    fell = any(size < FELL_PERCENT for size in gains)
     return words, likeliest.better >= LIKELY and not fell
 
 
