@@ -28,7 +28,8 @@ class Floors(NamedTuple):
 
 class Baseline(NamedTuple):
     """Of the champion's own recordings: the scale, what of the model they already hold to be otherwise, and
-    by cause the estimates of each night (nights, causes), their deviations and what they explain. Then the
+    by cause the estimates of each night (nights, causes), their deviations and what they explain, by the
+    models without that night and again by the champion's own. Then the
     logarithm of the variance of the noise (nights, p), its deviation, and the weighted error a sample
     (nights,)."""
 
@@ -85,7 +86,10 @@ def measured(
     models = without or [machine] * len(nights)
     scale = _scale(models, nights, loose, changes, floors)
     records = [rested(model, night, scale, changes) for model, night in zip(models, nights, strict=True)]
-    fits = [drift.alone(one, changes) for one in records]
+    # a new night is held against the champion's own model: what that one gets wrong of its own nights, and
+    # those without them do not, is no change of the machine either
+    held = [*records, *(rested(machine, night, scale, changes) for night in (nights if without else []))]
+    fits = [drift.alone(one, changes) for one in held]
     rest = [drift.left(one, changes) for one in records]
     noises = [noise(drift.by_output(one, e)) for one, e in zip(records, rest, strict=True)]
     return Baseline(

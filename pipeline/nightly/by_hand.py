@@ -6,10 +6,10 @@ from collections.abc import Callable, Generator
 
 from pipeline.nightly import champion, landing, remembered, screening, watch, worktree
 from pipeline.nightly.landing import Landing
-from pipeline.nightly.records import DRIFT_ACCEPTED, ROLLED_BACK, ChampionState, to_json
+from pipeline.nightly.records import DRIFT_ACCEPTED, ROLLED_BACK, ChampionState
 from pipeline.nightly.settings import Nightly
 from pipeline.nightly.worktree import COPY, Snapshot
-from pipeline.store import artifacts, params
+from pipeline.store import params
 
 
 def rollback(run: str, loop: str) -> str:
@@ -36,10 +36,10 @@ def accept(loop: str, why: str) -> str:
     reason; the champion itself stays. Raises ValueError if the loop has no alarm."""
     settings = params.load(Nightly, "nightly")
     with _alone() as state:
-        last = remembered.last()
-        recordings = last.drift.drifted.get(loop, [])
+        memory = remembered.read()
+        recordings = memory.drifted.get(loop, [])
         if loop not in state.champions or not recordings:
-            names = ", ".join(name for name, paths in last.drift.drifted.items() if paths) or "none"
+            names = ", ".join(name for name, paths in memory.drifted.items() if paths) or "none"
             raise ValueError(
                 f"{loop}: expected a loop with a champion and a drift alarm, found none; "
                 f"loops with an alarm: {names}"
@@ -59,8 +59,8 @@ def accept(loop: str, why: str) -> str:
             return champion.promote(state, loop, present, event=DRIFT_ACCEPTED, when=when, why=why)
 
         made = _change(state, change, f"drift accepted: {loop}: {why}")
-        drift = last.drift._replace(alarms=(), pending=(), drifted={**last.drift.drifted, loop: []})
-        artifacts.write_json(remembered.LAST, to_json(last._replace(drift=drift)))
+        memory.alarms, memory.pending, memory.drifted[loop] = [], [], []
+        remembered.write(memory)
         return f"{loop}: the champion is held against {', '.join(recordings)} from now on; commit {made[:12]}"
 
 

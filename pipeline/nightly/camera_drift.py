@@ -15,20 +15,15 @@ VISIBLE = 12.0  # gray levels by which a bead must stand out of its background t
 ALIKE = 0.5
 
 
-class FrameStats(NamedTuple):
-    """Of one night: median (6,) of FIGURES over the frames with a bead, its standard deviation (6,) (a figure
-    counts a frame as new only every fifth: beads are long), frames with one."""
-
-    mean: np.ndarray
-    deviation: np.ndarray
-    frames: int
+Stats = tuple[np.ndarray, np.ndarray]  # median and its standard deviation of a night's figures
 
 
-def figures(frames: Sequence[np.ndarray]) -> FrameStats:
-    """Of grey frames (h, w) with a line along the columns: row of its middle, how much lower it lies
-    at the right end than at the left, background level, contrast of the bead (below 0: dark on
-    light), steepest edge as a share of the contrast per px, width at half contrast in px. Raises
-    ValueError where fewer than five frames show a bead.
+def figures(frames: Sequence[np.ndarray]) -> Stats:
+    """Of grey frames (h, w) with a line along the columns, median (6,) of FIGURES and its standard deviation
+    (6,): row of its middle, how much lower it lies at the right end than at the left, background level,
+    contrast of the bead (below 0: dark on light), steepest edge as a share of the contrast per px, width at
+    half contrast in px. A figure counts a frame as new only every fifth: beads are long. Raises ValueError if
+    fewer than five frames show a bead.
     """
     rows = np.array([row for frame in frames if (row := _frame(np.asarray(frame, float))) is not None])
     if len(rows) < 5:
@@ -38,8 +33,7 @@ def figures(frames: Sequence[np.ndarray]) -> FrameStats:
         )
     # medians: a frame at the end of a line is no picture of it
     middle = np.median(rows, axis=0)
-    deviation = 1.4826 * 1.2533 * np.median(np.abs(rows - middle), axis=0) * np.sqrt(5.0 / len(rows))
-    return FrameStats(middle, deviation, len(rows))
+    return middle, 1.4826 * 1.2533 * np.median(np.abs(rows - middle), axis=0) * np.sqrt(5.0 / len(rows))
 
 
 def _frame(g: np.ndarray) -> np.ndarray | None:
@@ -83,65 +77,52 @@ class CameraChange(NamedTuple):
     sigmas: float
 
 
-class CameraMoves(NamedTuple):
-    """How far each of FIGURES has moved: in its own unit, as a share in percent, and in sigmas."""
-
-    by: dict[str, float]
-    percent: dict[str, float]
-    sigmas: dict[str, float]
+def shift_of(now: Stats, before: Sequence[Stats]) -> Shift:
+    """Figures of a night against those of the nights before."""
+    usual, deviations = (np.stack(each) for each in zip(*before, strict=True))
+    return shift(*now, usual, deviations)
 
 
 def changes(
-    now: FrameStats, before: Sequence[FrameStats], *, moved_px: float, contrast_percent: float
+    now: Stats, before: Sequence[Stats], *, moved_px: float, contrast_percent: float
 ) -> tuple[Shift, list[CameraChange]]:
     """What the camera's figures say, the cause named: moved, other light, other ink, out of focus. The bead's
     width is the process's own affair. Changes that do not matter are left out, however sure."""
-    usual = np.stack([stats.mean for stats in before])
-    moved = shift(now.mean, now.deviation, usual, np.stack([stats.deviation for stats in before]))
-    by = dict(zip(FIGURES, moved.value - moved.reference, strict=True))
-    share = {
-        name: 100 * by[name] / abs(reference) if reference else 0.0
-        for name, reference in zip(FIGURES, moved.reference, strict=True)
-    }
-    moves = CameraMoves(by, share, dict(zip(FIGURES, moved.sigmas, strict=True)))
-    causes = [*_camera_moved(moves, moved_px), *_light_or_ink(moves, contrast_percent)]
-    if abs(share["sharpness_per_px"]) >= 2 * contrast_percent and not causes:
-        words = f"the edges are {share['sharpness_per_px']:+.0f} % as steep: the focus has changed"
-        causes.append(CameraChange("focus", words, moves.sigmas["sharpness_per_px"]))
+    moved = shift_of(now, before)
+    by = moved.value - moved.reference
+    percent = 100 * np.divide(by, abs(moved.reference), out=np.zeros_like(by), where=moved.reference != 0)
+    row, tilt, background, contrast, sharpness, _ = range(len(FIGURES))
+    causes = []
+    if max(abs(by[row]), abs(by[tilt])) >= moved_px:
+        words = (
+            f"the camera has moved: the line lies {by[row]:+.1f} px lower and tilts by {by[tilt]:+.1f} px "
+            "across the picture; calibrate it again"
+        )
+        causes.append(CameraChange("camera", words, max(moved.sigmas[row], moved.sigmas[tilt], key=abs)))
+    if told := _light_or_ink(percent[background], percent[contrast], contrast_percent):
+        at = background if told[0] == "background" else contrast
+        causes.append(CameraChange(*told, moved.sigmas[at]))
+    if abs(percent[sharpness]) >= 2 * contrast_percent and not causes:
+        words = f"the edges are {percent[sharpness]:+.0f} % as steep: the focus has changed"
+        causes.append(CameraChange("focus", words, moved.sigmas[sharpness]))
     return moved, causes
 
 
-def _camera_moved(moves: CameraMoves, moved_px: float) -> list[CameraChange]:
-    row, tilt = moves.by["row_px"], moves.by["tilt_px"]
-    if not max(abs(row), abs(tilt)) >= moved_px:
-        return []
-    words = (
-        f"the camera has moved: the line lies {row:+.1f} px lower and tilts by {tilt:+.1f} px across the "
-        "picture; calibrate it again"
-    )
-    return [CameraChange("camera", words, max(moves.sigmas["row_px"], moves.sigmas["tilt_px"], key=abs))]
-
-
-def _light_or_ink(moves: CameraMoves, contrast_percent: float) -> list[CameraChange]:
-    """Background and contrast that change alike: the light. Contrast alone: the ink."""
-    background, contrast = moves.percent["background"], moves.percent["contrast"]
-    light, ink = abs(background) >= contrast_percent, abs(contrast) >= contrast_percent
+def _light_or_ink(background: float, contrast: float, limit: float) -> tuple[str, str] | None:
+    """Background and contrast that change alike, in percent: the light. Contrast alone: the ink."""
+    light, ink = abs(background) >= limit, abs(contrast) >= limit
     alike = min(abs(background), abs(contrast)) >= ALIKE * max(abs(background), abs(contrast))
     if (light or ink) and alike and background * contrast > 0:
-        words = (
+        return "light", (
             f"the light has changed: background {background:+.0f} % and contrast {contrast:+.0f} % together"
         )
-        return [CameraChange("light", words, moves.sigmas["contrast"])]
     if ink:
-        words = (
+        return "ink", (
             f"the ink looks different: contrast {contrast:+.0f} %, background {background:+.0f} %: another "
             "ink, or another surface under it"
         )
-        return [CameraChange("ink", words, moves.sigmas["contrast"])]
-    if light:
-        words = f"the background has changed by {background:+.0f} %: another surface, or stray light"
-        return [CameraChange("background", words, moves.sigmas["background"])]
-    return []
+    words = f"the background has changed by {background:+.0f} %: another surface, or stray light"
+    return ("background", words) if light else None
 
 
 # ---- the camera that looks at the nozzle: what of a print's frames is
@@ -150,30 +131,17 @@ def _light_or_ink(moves: CameraMoves, contrast_percent: float) -> list[CameraCha
 KINDS = ("are under-extruded", "are well extruded", "are over-extruded", "show no line that can be read")
 
 
-class Contrast(NamedTuple):
-    """Median contrast (1,) of the line in a print's frames, in gray
-    levels, and its standard deviation (1,)."""
-
-    mean: np.ndarray
-    deviation: np.ndarray
-
-
-def line_contrast(scores: np.ndarray, *, together: float) -> Contrast:
-    """Of the frames' ridge scores; frames come in segments of
-    `together` that look alike, and a segment counts once."""
+def line_contrast(scores: np.ndarray, *, together: float) -> Stats:
+    """Median contrast (1,) of the line in gray levels, of the frames' ridge scores, and its standard
+    deviation (1,); frames come in segments of `together` that look alike, and a segment counts once."""
     middle = float(np.median(scores))
     spread = 1.4826 * 1.2533 * float(np.median(np.abs(scores - middle)))
-    return Contrast(np.array([middle]), np.array([max(spread * np.sqrt(together / len(scores)), 1e-6)]))
+    return np.array([middle]), np.array([max(spread * np.sqrt(together / len(scores)), 1e-6)])
 
 
-def contrast_changes(now: Contrast, before: Sequence[Contrast], *, percent: float) -> list[CameraChange]:
+def contrast_changes(now: Stats, before: Sequence[Stats], *, percent: float) -> list[CameraChange]:
     """The line stands out less, or more, than in the prints before, by at least `percent`."""
-    moved = shift(
-        now.mean,
-        now.deviation,
-        np.stack([stats.mean for stats in before]),
-        np.stack([stats.deviation for stats in before]),
-    )
+    moved = shift_of(now, before)
     by = 100 * float(moved.value[0] / max(moved.reference[0], 1e-9) - 1)
     words = (
         f"the line stands out by {moved.value[0]:.0f} gray levels where {moved.reference[0]:.0f} were usual "

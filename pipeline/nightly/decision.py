@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.nightly.records import FIRST, KEPT, PROMOTED, Alarm, Guard, LoopDecision
+from pipeline.nightly.records import FIRST, KEPT, PROMOTED, Alarm, LoopDecision
 from pipeline.nightly.settings import PromotionRule
 from pipeline.statistics import Paired, blocks_needed, paired
 from pipeline.verdict.digits import THIN, beyond_meaning
@@ -48,7 +48,7 @@ def decide(
     against = _against(test, rule) + _guards(champion, challenger, allowed) + _unfit(challenger)
     against += [f"drift: {alarm.cause}; what the panel stands for has changed" for alarm in alarms]
     guards = {
-        name: Guard(before, challenger.guards[name], allowed.get(name, 0.0))
+        name: {"champion": before, "challenger": challenger.guards[name], "allowed": allowed.get(name, 0.0)}
         for name, before in champion.guards.items()
         if name in challenger.guards
     }
@@ -69,7 +69,10 @@ def _first(challenger: CaseCosts) -> LoopDecision:
         reasons.append("it was judged on no case")
     if failing:
         reasons.append(f"{len(failing)} of {len(challenger.cases)} cases fail, such as {failing[0]}")
-    guards = {name: Guard(None, figure, None) for name, figure in challenger.guards.items()}
+    guards = {
+        name: {"champion": None, "challenger": figure, "allowed": None}
+        for name, figure in challenger.guards.items()
+    }
     if not reasons:
         return LoopDecision(FIRST, ["there was no champion to compare with"], guards=guards)
     start = "there is no champion, and the challenger is not fit to be one: "

@@ -30,9 +30,12 @@ from pipeline.temperature.plant import Plant, clip_spectral_radius
 BLOCKS = 12  # into which a record is cut for the variance of an estimate
 SHORTEST = 96  # samples of a record that is asked
 COURSE = 8  # degree of the polynomial that the air around may follow within a segment
-LONGEST_DELAY = 64  # samples; a longer one is a mistake of the record
-GAIN_LIMITS, RATE_LIMITS, OFFSET_LIMITS = (-0.98, 1.0), (-0.6, 1.5), (-60.0, 60.0)
-STEPS = {"gain": 0.02, "time constant": 0.02, "delay": 1.0, "late sensor": 1.0, "offset": 0.1}
+# by kind of cause: the step of a derivative, and the ends between which it is looked for; a delay that is
+# longer is a mistake of the record
+RANGES = {
+    "gain": (0.02, -0.98, 1.0), "time constant": (0.02, -0.6, 1.5), "offset": (0.1, -60.0, 60.0),
+    "delay": (1.0, -16.0, 64.0), "late sensor": (1.0, -16.0, 64.0),
+}  # fmt: skip
 SURE = 5.0  # a cause is named from so many sigmas on, squared: what it explains beyond the noise
 # of what the first cause explains, a second one must explain so much: less is what the model gets wrong of it
 REMAINDER = 0.004
@@ -103,11 +106,6 @@ class RoomAir(NamedTuple):
     course: float
     draught: float
     another_season: bool = True
-
-    @property
-    def calm(self) -> bool:
-        """As still as any room, and the air as on the champion's own nights."""
-        return self.course <= CALM and not self.draught and not self.another_season
 
 
 # from a closed room to an open door; the record itself says which (empirical Bayes)
@@ -459,14 +457,6 @@ def _padded(values: np.ndarray, one: RecordSegment) -> np.ndarray:
 # ---- one cause
 
 
-def _limits(cause: DriftCause) -> tuple[float, float]:
-    delay = (-0.25 * LONGEST_DELAY, float(LONGEST_DELAY))
-    return {
-        "gain": GAIN_LIMITS, "time constant": RATE_LIMITS, "offset": OFFSET_LIMITS,
-        "delay": delay, "late sensor": delay,
-    }[cause.kind]  # fmt: skip
-
-
 def fitted(
     record: DriftRecord, changes: MachineChanges, cause: DriftCause, start: np.ndarray | None = None
 ) -> CauseFit:
@@ -475,8 +465,7 @@ def fitted(
     before = left(record, changes) if start is None else start
     if cause.kind == "saturation":
         return _capped(record, changes, cause, before)
-    low, high = _limits(cause)
-    step, value, J = STEPS[cause.kind], 0.0, float(before @ before)
+    (step, low, high), value, J = RANGES[cause.kind], 0.0, float(before @ before)
     e, whole = before, J
     if cause.kind in ("delay", "late sensor"):
         for guess in (6.0, 20.0, 40.0):
@@ -561,12 +550,10 @@ def alone(record: DriftRecord, changes: MachineChanges) -> list[CauseFit]:
 
 
 class NamedCause(NamedTuple):
-    """A change that explains the record, with the rivals that it cannot be told from; `sigmas` is how sure
-    it is that something changed."""
+    """A change that explains the record, with the rivals that it cannot be told from."""
 
     fit: CauseFit
     rivals: list[CauseFit]
-    sigmas: float
 
 
 class Explanation(NamedTuple):
@@ -600,7 +587,7 @@ def explain(record: DriftRecord, changes: MachineChanges, usual: Mapping[DriftCa
             for k, fit in enumerate(fits)
             if k != best and worth[best] - worth[k] < RIVALS * _colour(fits[best])
         ]
-        found.append(NamedCause(fits[best], rivals, np.sqrt(worth[best])))
+        found.append(NamedCause(fits[best], rivals))
         now = with_change(now, fits[best].cause, fits[best].value)
         before = left(record, now)
         taken = {named.fit.cause for named in found}
@@ -699,17 +686,20 @@ def shift(
     before_deviation: np.ndarray,
     *,
     freedom: int = BLOCKS - 1,
+    nights: int = 0,
 ) -> Shift:
-    """value (k,) against those of the reference nights before (nights, k): their mean, and as noise both
-    nights' own and what they scatter beyond it (DerSimonian and Laird 1986).
+    """value (k,) against those of the reference nights before (rows, k): their mean, and as noise both
+    nights' own and what they scatter beyond it (DerSimonian and Laird 1986). `nights` is how many of the rows
+    are independent, 0 if all are.
 
     A night's own deviation has `freedom`, the scatter of a few nights less: both count with the
     degrees of freedom that they have (Satterthwaite 1946), and the ratio is brought to the sigmas
     that a normal variable would need to be as unlikely.
     """
-    nights = len(before)
+    nights = nights or len(before)
     inside = (before_deviation**2).mean(axis=0)
-    between = np.maximum(before.var(axis=0, ddof=1) - inside, 0.0) if nights > 1 else np.zeros_like(inside)
+    scattered = before.var(axis=0) * nights / max(nights - 1, 1)
+    between = np.maximum(scattered - inside, 0.0) if nights > 1 else np.zeros_like(inside)
     own, scatter = np.maximum(deviation**2 + inside / nights, 1e-24), between * (1 + 1 / nights)
     spread = np.sqrt(own + scatter)
     t = (value - before.mean(axis=0)) / spread

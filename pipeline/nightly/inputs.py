@@ -6,7 +6,7 @@ import itertools
 import json
 import os
 import shutil
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import yaml
@@ -186,17 +186,6 @@ def _holds(pointer: Path, name: str) -> bool:
     return any(file == name or file.startswith(f"{name}/") for file in held)
 
 
-def after_quarantine(
-    digests: Mapping[str, str], quarantined: Collection[str], loops: Mapping[str, NightlyLoop], hashes: Hashes
-) -> dict[str, str]:
-    """`digests` once these recordings are set aside: without those that were moved, and with the lists of
-    those that stayed. Of what has come meanwhile nothing."""
-    moved = [name for name in quarantined if not Path(name).exists()]
-    left = {name: content for name, content in digests.items() if not lies_in(name, moved)}
-    lists = [Path(loop.recordings) / excluded.FILE for loop in loops.values() if loop.recordings]
-    return left | {path.as_posix(): hashes.of(path) for path in lists if path.is_file()}
-
-
 def read_lists(settings: Nightly, copy: Path) -> dict[str, str]:
     """{path: text} of the lists of excluded recordings that lie in the copy."""
     paths = [Path(loop.recordings) / excluded.FILE for loop in settings.loops.values() if loop.recordings]
@@ -217,7 +206,7 @@ def recorded_places(settings: Nightly) -> list[str]:
     ]
 
 
-def uncommitted(settings: Nightly) -> tuple[str, ...]:
+def find_uncommitted(settings: Nightly) -> list[str]:
     """Code, parameters and other sources that differ from the last commit, or are in none. What a night's own
     commit holds, recordings among it, is none of these."""
     own = ["dvc.lock", "reports", "champion.json", "champion", "datasets/.gitignore"]
@@ -226,4 +215,4 @@ def uncommitted(settings: Nightly) -> tuple[str, ...]:
     ]
     code = [name for name in sources() if not lies_in(name, own)]
     paths = {*changed(), *(changed(*code, untracked="all") if code else ())}
-    return tuple(sorted(path for path in paths if not lies_in(path, own)))
+    return sorted(path for path in paths if not lies_in(path, own))

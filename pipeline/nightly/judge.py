@@ -11,7 +11,6 @@ import numpy as np
 from pipeline.deposition.tables import SCORES
 from pipeline.nightly import inputs
 from pipeline.nightly.decision import CaseCosts
-from pipeline.nightly.records import RecordShare
 from pipeline.nightly.settings import HoldOut, Nightly, NightlyLoop, PromotionRule
 from pipeline.recordings import recording_folders
 from pipeline.recordings.isolated import Budget
@@ -344,7 +343,7 @@ def _holdout_records(h: HoldOut, machine: Machine) -> list[tuple[np.ndarray, np.
     return [pair for pairs in record_segments(Path(h.recordings), machine).values() for pair in pairs]
 
 
-def measure_shares(settings: Nightly, paths: Sequence[str]) -> dict[str, RecordShare]:
+def measure_shares(settings: Nightly, paths: Sequence[str]) -> dict[str, dict[str, float]]:
     """How much of each of these recordings of the temperature loop is learned from: samples with every
     signal, in gapless stretches."""
     folders = [loop.recordings for loop in settings.loops.values() if loop.judge == "temperature"]
@@ -357,14 +356,15 @@ def measure_shares(settings: Nightly, paths: Sequence[str]) -> dict[str, RecordS
     return {path: _share(results[name], machine) for path, name in within.items() if name in results}
 
 
-def _share(result: RecordingTable, machine: Machine) -> RecordShare:
+def _share(result: RecordingTable, machine: Machine) -> dict[str, float]:
     kinds, messages = result.quality["kind"], result.quality["message"]
     cut = [float(str(message).partition(" %")[0]) for message in messages[kinds == "cut"]]
     cut_percent = min(max(cut, default=0.0), 99.0)
     whole = len(result.record["time_s"]) / (1 - cut_percent / 100)
     used = sum(np.isfinite(y).all(axis=1).sum() for _, y in segments(result.record, machine))
     masked = np.mean([column for name, column in result.record.items() if name.endswith("_masked")])
-    return RecordShare(*(round(float(p), 1) for p in (100 * used / whole, 100 * masked, cut_percent)))
+    shares = {"used": 100 * used / whole, "masked": 100 * masked, "cut": cut_percent}
+    return {f"{name}_percent": round(float(share), 1) for name, share in shares.items()}
 
 
 def _is_recorded() -> bool:

@@ -21,20 +21,20 @@ BETTER = 30.0  # by which the mean squared error must fall
 HONEST = 2.0  # of the largest of the champion's own records: what an honest one may leave
 AS_MUCH = 2.0  # a change of the machine that leaves up to so much more explains as much
 ROOM = drift.RESTLESS._replace(another_season=False)  # the air is not 48 °C warmer: that is °F
-ALIKE = (
-    2.0  # what is left with two mistakes undone that a record does not tell apart: heaters / 10, sensors * 10
-)
+# what is left with two mistakes undone that a record does not tell apart: one sensor, or every one
+ALIKE = 2.0
 FARTHEST = 128  # samples by which a clock is looked for
 
 Undo = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Mistake(NamedTuple):
-    """What is wrong with a record in words, the record with that undone, and by how much its mean squared
-    error falls."""
+    """What is wrong with a record in words, the record with that undone, the mean squared error that it then
+    leaves, and how many times that was larger."""
 
     words: str
     undone: Segments
+    left: float
     better: float
 
     @property
@@ -54,22 +54,19 @@ def found(
     inputs: Sequence[str],
     outputs: Sequence[str],
 ) -> Mistake | None:
-    """The mistake that was made in writing a record; None where it is what it says, or where a change of the
-    machine explains it as well. Raises ValueError where the record is too short."""
+    """The mistake that was made in writing a record; None if it is what it says, or if a change of the
+    machine explains it as well. Raises ValueError if the record is too short."""
     asked = drift.record(machine, segments, own.scale, ROOM)
     as_is = baseline.misfit(asked, own.changes)
     if as_is < BETTER:
         return None
     mistake = likeliest(machine, segments, own, inputs=inputs, outputs=outputs)
-    left = as_is / mistake.better
-    if left > honest(own) or mistake.better < BETTER:
+    if mistake.left > honest(own) or mistake.better < BETTER:
         return None
     samples = sum(int(one.measured.sum()) for one in asked.segments)
     every_delay = drift.DriftCause("delay", -1)  # which is a shifted clock by another name
     explained = [fit.explained for fit in drift.alone(asked, own.changes) if fit.cause != every_delay]
-    if as_is - max(explained) / samples < AS_MUCH * left:
-        return None
-    return mistake
+    return None if as_is - max(explained) / samples < AS_MUCH * mistake.left else mistake
 
 
 def honest(own: Baseline) -> float:
@@ -85,18 +82,13 @@ def likeliest(
     inputs: Sequence[str],
     outputs: Sequence[str],
 ) -> Mistake:
-    """Of all mistakes the one that explains the record best with it undone, be that well or not. Raises
-    ValueError where the record is too short."""
+    """Of all mistakes the one that explains the record best with it undone, be that well or not; mistakes
+    that explain as much are named with it. Raises ValueError if the record is too short.
+
+    Sensors that are scaled down err less for that alone: what is compared is the likelihood of the record as
+    it was written, |e|^2 / samples - 2 log scale, which takes the density of what was undone to its units.
+    """
     as_is = baseline.misfit(drift.record(machine, segments, own.scale, ROOM), own.changes)
-    left, words, undone = _best(machine, segments, own, inputs, outputs)
-    return Mistake(words, undone, as_is / left)
-
-
-def _best(
-    machine: ProductionModel, segments: Segments, own: Baseline, inputs: Sequence[str], outputs: Sequence[str]
-) -> tuple[float, str, Segments]:
-    """Of the mistake that leaves least with it undone: what is left, its words with those of mistakes that
-    leave as little, and the record undone."""
 
     def left(undone: Segments) -> float:
         try:
@@ -105,23 +97,28 @@ def _best(
             return np.inf
 
     tried = []
-    for words, undo in (*_swaps(inputs, outputs), *_units(inputs, outputs)):
+    for words, undo, scale in (*_swaps(inputs, outputs), *_units(inputs, outputs)):
         undone = [undo(u, y) for u, y in segments]
-        tried.append((left(undone), words, undone))
-    tried.append(_clock(segments, left, machine.plant.sample_time_s))
-    tried.sort(key=lambda one: one[0])
-    least, words, undone = tried[0]
-    as_good = [other for cost, other, _ in tried[1:3] if cost < ALIKE * least]
-    return least, ", or ".join([words, *as_good]), undone
+        rest = left(undone)
+        tried.append((rest - 2 * np.log(scale), rest, words, undone))
+    rest, words, undone = _clock(segments, left, machine.plant.sample_time_s)
+    tried.append((rest, rest, words, undone))
+    (least, rest, words, undone), *others = sorted(tried, key=lambda one: one[0])
+    as_good = [
+        other
+        for cost, remainder, other, _ in others[:2]
+        if cost < least + (ALIKE - 1) * rest and remainder < (as_is + rest) / 2
+    ]
+    return Mistake(", or ".join([words, *as_good]), undone, rest, as_is / rest)
 
 
-def _swaps(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo]]:
+def _swaps(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo, float]]:
     for j, i in itertools.combinations(range(len(outputs)), 2):
         words = f"the sensors {outputs[j]} and {outputs[i]} are swapped"
-        yield words, lambda u, y, at=(i, j): (u, _swapped(y, at))
+        yield words, lambda u, y, at=(i, j): (u, _swapped(y, at)), 1.0
     for j, i in itertools.combinations(range(len(inputs)), 2):
         words = f"the inputs {inputs[j]} and {inputs[i]} are swapped"
-        yield words, lambda u, y, at=(i, j): (_swapped(u, at), y)
+        yield words, lambda u, y, at=(i, j): (_swapped(u, at), y), 1.0
 
 
 def _swapped(values: np.ndarray, at: tuple[int, int]) -> np.ndarray:
@@ -130,8 +127,9 @@ def _swapped(values: np.ndarray, at: tuple[int, int]) -> np.ndarray:
     return values
 
 
-def _units(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo]]:
-    """Wrong units and factors, of every signal and of each."""
+def _units(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo, float]]:
+    """Wrong units and factors, of every signal and of each; last the factor by which undoing it scales the
+    outputs' errors, their geometric mean."""
     every = slice(None)
     sensors = (
         ("in °F where °C is declared", 1 / 1.8, -32 / 1.8),
@@ -148,11 +146,12 @@ def _units(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str,
     for at, name in ((every, "every sensor"), *enumerate(outputs)):
         for unit, factor, offset in sensors:
             change = (at, factor, offset)
-            yield f"{name} is {unit}", lambda u, y, change=change: (u, _scaled(y, *change))
+            scale = factor if at == every else factor ** (1 / len(outputs))
+            yield f"{name} is {unit}", lambda u, y, change=change: (u, _scaled(y, *change)), scale
     for at, name in ((every, "every input"), *enumerate(inputs)):
         for unit, factor in heaters:
             change = (at, factor, 0.0)
-            yield f"{name} is {unit}", lambda u, y, change=change: (_scaled(u, *change), y)
+            yield f"{name} is {unit}", lambda u, y, change=change: (_scaled(u, *change), y), 1.0
 
 
 def _scaled(values: np.ndarray, at: int | slice, factor: float, offset: float) -> np.ndarray:

@@ -1,17 +1,17 @@
 """The cameras' part of a night: pictures of new recordings held against those that the champion was made of;
 and what of all that has changed is an alarm."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.nightly import camera_drift
 from pipeline.nightly.inputs import quarantine
-from pipeline.nightly.records import Alarm, LoopDrift
+from pipeline.nightly.records import Alarm, NightDrift
 from pipeline.nightly.settings import DriftLimits
-from pipeline.recordings import trial_files
+from pipeline.recordings import nozzle_frames, trial_files
 from pipeline.recordings.excluded import readable
 from pipeline.store import params
 
@@ -26,8 +26,8 @@ FRAMES = 40  # pictures of a recording that are looked at
 
 
 def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[Any]]:
-    """[median, deviation, frames] of each of the last `most` trials below `folder`
-    whose pictures show a bead; `only` those named."""
+    """[median, deviation] of each of the last `most` trials below `folder` whose pictures show a bead; `only`
+    those named."""
     rows, camera = [], _camera()
     trials = readable(sorted(folder.rglob("*.mcap")), folder)
     paths = [path for path in trials if not only or path.as_posix() in only]
@@ -36,7 +36,7 @@ def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
             stats = _frame_stats(trial_files.open_trial(path, **camera.recording))
         except ValueError:
             continue
-        rows.append([stats.mean.tolist(), stats.deviation.tolist(), stats.frames])
+        rows.append([part.tolist() for part in stats])
     return rows
 
 
@@ -47,7 +47,7 @@ def _camera() -> "Camera":
     return params.load(Camera, "camera").model_copy(update={"unreadable_share": 1.0})
 
 
-def _frame_stats(trial: trial_files.TrialRecording) -> camera_drift.FrameStats:
+def _frame_stats(trial: trial_files.TrialRecording) -> camera_drift.Stats:
     frames = trial.frames
     every = max(len(frames.time_s) // FRAMES, 1)
     return camera_drift.figures(
@@ -55,132 +55,117 @@ def _frame_stats(trial: trial_files.TrialRecording) -> camera_drift.FrameStats:
     )
 
 
-def trials_drift(
-    limits: DriftLimits, loop: str, paths: Sequence[str], reference: Mapping[str, Any], pending: set[str]
-) -> LoopDrift:
-    """Of new trials: those that cannot be read are set aside, the others' pictures held against those of
-    `reference`."""
-    drifted, camera = LoopDrift.none(loop), _camera()
-    before = [
-        camera_drift.FrameStats(np.array(mean), np.array(deviation), frames)
-        for mean, deviation, frames in reference.get("camera", [])
-    ]
+def find_trials_drift(
+    drift: NightDrift,
+    limits: DriftLimits,
+    loop: str,
+    paths: Sequence[str],
+    reference: Sequence[Sequence[Any]],
+    pending: Collection[str],
+) -> None:
+    """Adds what new trials say: those that cannot be read are set aside, the others' pictures held against
+    those of `reference`."""
+    camera = _camera()
+    before = [(np.array(row[0]), np.array(row[1])) for row in reference]
     for path in (path for path in paths if path.lower().endswith(".mcap")):
         try:
             trial = trial_files.open_trial(path, **camera.recording)
         except ValueError as error:
-            drifted.quarantined[path] = quarantine(path, loop, str(error))
+            drift.quarantined[path] = quarantine(path, loop, str(error))
             continue
         if not before:
-            drifted.notes.append(
-                f"{path}: the champion has no pictures of its own: the camera was not judged"
-            )
+            drift.notes.append(f"{path}: the champion has no pictures of its own: the camera was not judged")
             continue
         try:
             _, causes = camera_drift.changes(
-                _frame_stats(trial), before, moved_px=limits.camera_px,
+                _frame_stats(trial),
+                before,
+                moved_px=limits.camera_px,
                 contrast_percent=limits.contrast_percent,
-            )  # fmt: skip
+            )
+            add_alarms(drift, limits, loop, path, causes, pending)
         except ValueError as error:
-            drifted.notes.append(f"{path}: {error}")
-            continue
-        drifted = with_alarms(drifted, limits, path, causes, pending)
-    return drifted
+            drift.notes.append(f"{path}: {error}")
 
 
 # ---- setpoint: the camera that looks at the nozzle
 
 
-class PrintFigures(NamedTuple):
-    """Of one print: frames by class and without a line (4,), frames of a segment, and the line's contrast."""
-
-    name: str
-    counts: np.ndarray
-    segment_frames: float
-    contrast: camera_drift.Contrast
-
-    def to_json(self) -> list[Any]:
-        """As the champion's reference.json keeps it."""
-        contrast = [self.contrast.mean.tolist(), self.contrast.deviation.tolist()]
-        return [self.name, self.counts.tolist(), self.segment_frames, *contrast]
-
-
 def of_prints(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[Any]]:
-    """What reference.json keeps of the last `most` prints below `folder`; `only` those named."""
-    return [figures.to_json() for figures in _print_figures(folder, most, only)]
-
-
-def _print_figures(folder: Path, most: int, only: Sequence[str] = ()) -> list[PrintFigures]:
-    from pipeline.recordings import nozzle_frames
+    """Of each of the last `most` prints below `folder`, `only` those named: name, frames by class and without
+    a line (4,), frames of a segment, the line's median contrast and its deviation, as reference.json keeps
+    them."""
     from pipeline.setpoint.recordings import read_options
-    from pipeline.setpoint.settings import SetpointMaterial, TrainClassifier
+    from pipeline.setpoint.settings import SetpointMaterial
 
-    settings = params.load(TrainClassifier, "train_classifier")
-    if settings.source != "recordings":
+    if not (settings := _classifier()):
         return []
     material = params.load(SetpointMaterial, "setpoint_material").material()
     frames = nozzle_frames.read_folder(
         folder, read_options(settings, material), params.load(params.Execution, "execution")
     )
-    prints = []
+    rows = []
     numbered = [(number, name) for number, name in enumerate(frames.prints) if not only or name in only]
     for number, name in numbered[-most:]:
         here = frames.print_number == number
         good = here & frames.valid & (frames.label >= 0)
         if good.any():
             classes = np.bincount(frames.label[good], minlength=3).tolist()
-            counts = np.array([*classes, int((here & ~frames.valid).sum())])
+            counts = [*classes, int((here & ~frames.valid).sum())]
             together = float(here.sum() / len(np.unique(frames.segment[here])))
             contrast = camera_drift.line_contrast(frames.score[good], together=together)
-            prints.append(PrintFigures(name, counts, together, contrast))
-    return prints
+            rows.append([name, counts, together, *(part.tolist() for part in contrast)])
+    return rows
 
 
-def prints_drift(
+def _classifier() -> "TrainClassifier | None":
+    """Section `train_classifier` if it learns from recordings."""
+    from pipeline.setpoint.settings import TrainClassifier
+
+    settings = params.load(TrainClassifier, "train_classifier")
+    return settings if settings.source == "recordings" else None
+
+
+def find_prints_drift(
+    drift: NightDrift,
     limits: DriftLimits,
     loop: str,
     folder: str,
     paths: Sequence[str],
     reference: Sequence[Sequence[Any]],
-    pending: set[str],
-) -> LoopDrift:
-    """Drift of the new prints `paths` in the loop's folder of recordings. A file that cannot be read is set
-    aside. Classes, frames without a line, and the line's contrast are compared with the prints that the
-    champion's reference.json has under "camera"."""
-    from pipeline.setpoint.settings import TrainClassifier
-
-    drifted = LoopDrift.none(loop)
-    settings = params.load(TrainClassifier, "train_classifier")
-    if settings.source != "recordings":
-        return drifted
+    pending: Collection[str],
+) -> None:
+    """Adds what the new prints `paths` in the loop's folder of recordings say. A file that cannot be read is
+    set aside. Classes, frames without a line, and the line's contrast are compared with the prints of
+    `reference`."""
+    if not (settings := _classifier()):
+        return
     for path in paths:
         if reason := _unreadable(path, settings):
-            drifted.quarantined[path] = quarantine(path, loop, reason)
-    before = [
-        PrintFigures(name, np.array(counts), together, camera_drift.Contrast(np.array(mean), np.array(std)))
-        for name, counts, together, mean, std in reference
-    ]
-    if not before:
-        return drifted
-    names = {figures.name for figures in before}
+            drift.quarantined[path] = quarantine(path, loop, reason)
+    if not reference:
+        return
+    names = {row[0] for row in reference}
+    usual = np.array([row[1] for row in reference])
+    contrasts = [(np.array(row[3]), np.array(row[4])) for row in reference]
     try:
-        prints = [figures for figures in _print_figures(Path(folder), 10**6) if figures.name not in names]
+        prints = [row for row in of_prints(Path(folder), 10**6) if row[0] not in names]
     except ValueError as error:  # what the stage will refuse as well, and say so
-        drifted.notes.append(str(error))
-        return drifted
-    usual, contrasts = np.array([figures.counts for figures in before]), [p.contrast for p in before]
-    for figures in prints:
-        causes = camera_drift.balance_changes(
-            figures.counts, usual, together=figures.segment_frames, points=limits.balance_points
-        )
-        causes += camera_drift.contrast_changes(figures.contrast, contrasts, percent=limits.contrast_percent)
-        drifted = with_alarms(drifted, limits, figures.name, causes, pending)
-    return drifted
+        drift.notes.append(str(error))
+        return
+    for name, counts, together, middle, deviation in prints:
+        contrast = np.array(middle), np.array(deviation)
+        causes = [
+            *camera_drift.balance_changes(
+                np.array(counts), usual, together=together, points=limits.balance_points
+            ),
+            *camera_drift.contrast_changes(contrast, contrasts, percent=limits.contrast_percent),
+        ]
+        add_alarms(drift, limits, loop, name, causes, pending)
 
 
 def _unreadable(path: str, settings: "TrainClassifier") -> str:
-    """Why a print's file cannot be read; empty where it can."""
-    from pipeline.recordings import nozzle_frames
+    """Why a print's file cannot be read; empty if it can."""
     from pipeline.setpoint.recordings import read_options
 
     try:
@@ -196,23 +181,20 @@ def _unreadable(path: str, settings: "TrainClassifier") -> str:
 # ---- what is an alarm
 
 
-def with_alarms(
-    drifted: LoopDrift,
+def add_alarms(
+    drift: NightDrift,
     limits: DriftLimits,
+    loop: str,
     path: str,
     causes: Sequence[camera_drift.CameraChange],
-    pending: set[str],
-    consequences: Sequence[str] = (),
-) -> LoopDrift:
-    """The loop's drift with the causes that a recording shows. A cause is an alarm where it is sure at once,
-    or has been watched the night before (`pending`); it is watched where it is nearly sure."""
-    alarms, watched = list(drifted.alarms), list(drifted.watched)
+    pending: Collection[str],
+) -> None:
+    """Adds the causes that a recording shows. A cause is an alarm if it is sure at once, or has been watched
+    the night before (`pending`); it is watched if it is nearly sure."""
     for key, words, sigmas in causes:
-        key = f"{drifted.loop}: {key}"
-        alarm = Alarm(drifted.loop, key, path, words, round(float(sigmas), 1), tuple(consequences))
+        alarm = Alarm(loop, f"{loop}: {key}", path, words, round(float(sigmas), 1))
         nearly_sure = abs(sigmas) >= limits.watch_sigmas
-        if abs(sigmas) >= limits.alarm_sigmas or (nearly_sure and key in pending):
-            alarms.append(alarm)
+        if abs(sigmas) >= limits.alarm_sigmas or (nearly_sure and alarm.key in pending):
+            drift.alarms.append(alarm)
         elif nearly_sure:
-            watched.append(alarm)
-    return drifted._replace(alarms=alarms, watched=watched)
+            drift.watched.append(alarm)

@@ -7,7 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 STATE = Path(".beadline")
@@ -26,19 +26,6 @@ def git(
 ) -> str:
     """Standard output of `git ...`, in the worktree `place` if it is named; `text` is its input. Raises
     ValueError with git's own reason if it fails and `check` is on."""
-    return _output(arguments, env or {}, check=check, place=place, text=text).strip()
-
-
-def names(*arguments: str, env: Mapping[str, str] | None = None, place: Path | str = "") -> list[str]:
-    """The paths that `git ... -z` prints, whatever characters they have. Raises ValueError if it fails."""
-    command, *rest = arguments
-    printed = _output((command, "-z", *rest), env or {}, check=True, place=place, text="")
-    return [name for name in printed.split("\0") if name]
-
-
-def _output(
-    arguments: Sequence[str], env: Mapping[str, str], *, check: bool, place: Path | str, text: str
-) -> str:
     ended = subprocess.run(
         ["git", *(("-C", str(place)) if place else ()), *arguments],
         check=False,
@@ -46,7 +33,7 @@ def _output(
         encoding="utf-8",
         errors="surrogateescape",  # as Python names files whose names are no text
         # a recording may be called [1].csv, which git would take for a pattern
-        env={**os.environ, "GIT_LITERAL_PATHSPECS": "1", **env},
+        env={**os.environ, "GIT_LITERAL_PATHSPECS": "1", **(env or {})},
         input=text,
     )
     if check and ended.returncode:
@@ -55,7 +42,14 @@ def _output(
         raise ValueError(
             f"git {arguments[0]} failed: {why[-1] if why else f'exit status {ended.returncode}'}"
         )
-    return ended.stdout if ended.returncode == 0 else ""
+    return "" if ended.returncode else ended.stdout.rstrip("\n")
+
+
+def names(
+    command: str, *rest: str, env: Mapping[str, str] | None = None, place: Path | str = ""
+) -> list[str]:
+    """The paths that `git ... -z` prints, whatever characters they have. Raises ValueError if it fails."""
+    return [name for name in git(command, "-z", *rest, env=env, place=place).split("\0") if name]
 
 
 def changed(*places: str, untracked: str = "no") -> list[str]:

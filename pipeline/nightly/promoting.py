@@ -2,20 +2,19 @@
 which nothing runs; one that passes goes in production where it is better than the champion, or there is none.
 """
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pipeline.nightly import champion, judge, records, reporting, screening, verdicts
-from pipeline.nightly.decision import decide
+from pipeline.nightly.decision import CaseCosts, decide
 from pipeline.nightly.records import (
     CANDIDATE,
     KEPT,
     Champion,
-    ChampionMetrics,
     ChampionState,
-    Lineage,
     LoopDecision,
     Night,
     candidate_of,
@@ -33,19 +32,18 @@ CERTIFICATE = f"{EXPORTED}/certificate.json"
 CERTIFIED = (f"{EXPORTED}/controller.json", f"{EXPORTED}/arrays.safetensors", CERTIFICATE)
 
 
-# what was decided of a loop's challenger, and what it measured; None where it was not measured
-JudgedLoop = tuple[LoopDecision, ChampionMetrics | None]
+# what was decided of a loop's challenger, and what the judge measured of it, if it was measured
+JudgedLoop = tuple[LoopDecision, Mapping[str, Any] | None]
 
 
 def judge_all(
-    settings: Nightly, night: Night, state: ChampionState, *, lineage: Callable[[], Lineage]
-) -> tuple[Night, ChampionState]:
-    """The night with a decision on each loop; what is in production, and the candidates beside it. Their
-    files lie in champion/<loop> and champion/<loop>.candidate by then. Raises ValueError where no loop can be
+    settings: Nightly, night: Night, state: ChampionState, lineage: Mapping[str, Any]
+) -> ChampionState:
+    """What is in production, and the candidates beside it; the night has a decision on each loop. Their files
+    lie in champion/<loop> and champion/<loop>.candidate by then. Raises ValueError if no loop can be
     judged."""
-    by_loop, night = verdicts.read_verdicts(settings, night)
-    made_from = lineage()  # with the lock of the pages, where they were made anew
-    decisions: dict[str, LoopDecision] = {}
+    by_loop = verdicts.read_verdicts(settings, night)
+    made_from = {**lineage, "dvc_lock": artifacts.sha256("dvc.lock")} if lineage else {}
     for name in settings.loops:
         verdict = by_loop.get(name)
         try:
@@ -55,24 +53,18 @@ def judge_all(
             decision = LoopDecision(records.FAILED, [f"it cannot be judged, and its champion stays: {why}"])
             metrics = None
         decision = decision._replace(verdict=verdict and verdict._replace(rules=()))
-        decisions[name] = decision
-        if decision.promotes or decision.decision == CANDIDATE:
+        night.decisions[name] = decision
+        waits = decision.decision == CANDIDATE
+        if decision.promotes or waits:
             state = _place(settings, name, night, state, (decision, metrics), made_from)
-        if (
-            name in state.candidates
-            and decision.decision != CANDIDATE
-            and verdict
-            and verdict.state == PASSED
-        ):
+        if name in state.candidates and not waits and verdict and verdict.state == PASSED:
             state = _drop_candidate(state, name)
-    if all(decision.decision == records.FAILED for decision in decisions.values()):
-        whys = (f"{name}: {decision.reasons[0]}" for name, decision in decisions.items())
-        raise ValueError("; ".join(whys))
-    promoted = tuple(name for name, decision in decisions.items() if decision.promotes)
-    night = night._replace(decisions=decisions, promoted=promoted)
-    outcome = records.PROMOTED if promoted else CANDIDATE if night.candidates else KEPT
-    reasons = (f"{name}: {reason}" for name, decision in decisions.items() for reason in decision.reasons)
-    return night.ended(outcome, *reasons), state
+    if night.lost == list(night.decisions):
+        raise ValueError("; ".join(f"{name}: {one.reasons[0]}" for name, one in night.decisions.items()))
+    outcome = records.PROMOTED if night.promoted else CANDIDATE if night.candidates else KEPT
+    reasons = (f"{name}: {reason}" for name, one in night.decisions.items() for reason in one.reasons)
+    night.end(outcome, *reasons)
+    return state
 
 
 # ---- one loop
@@ -81,8 +73,8 @@ def judge_all(
 def judge_loop(
     settings: Nightly, name: str, night: Night, state: ChampionState, verdict: Verdict | None
 ) -> JudgedLoop:
-    """What becomes of the challenger of one loop, with what it measured; `verdict` is None where the loop has
-    no page."""
+    """What becomes of the challenger of one loop, with what it measured; `verdict` is None if the loop has no
+    page."""
     loop, present = settings.loops[name], state.champions.get(name)
     files = list_files(loop)
     contestant = verdict.subject if verdict else _declared(settings, name)
@@ -96,9 +88,8 @@ def judge_loop(
     if run := champion.find_rolled_back(state, name, files):
         return _keep(f"the challenger is that of {run}, which was rolled back by hand")
     judging = judge.judge(loop, settings)
-    if not passes:
-        return _candidate(judging, verdict, state.candidates.get(name), files, verdict.sentence)
-    if verdict and (why := find_missing_certificate(loop, contestant)):
+    why = find_missing_certificate(loop, contestant) if passes else verdict.sentence
+    if verdict and why:
         return _candidate(judging, verdict, state.candidates.get(name), files, why)
     own = f"datasets/{judge.DESIGNED_FROM[contestant]}" if contestant in judge.DESIGNED_FROM else ""
     if own and own not in loop.artifacts:
@@ -118,7 +109,7 @@ def judge_loop(
         challenger,
         settings.rule,
         allowed=judging.allowed(before) if before else {},
-        alarms=night.drift.of(name).alarms,
+        alarms=[alarm for alarm in night.drift.alarms if alarm.loop == name],
         seed=night.number,
     )
     return decision, _metrics(challenger)
@@ -143,15 +134,18 @@ def _keep(reason: str) -> JudgedLoop:
     return LoopDecision(KEPT, [reason]), None
 
 
-def _metrics(evidence: judge.CaseCosts) -> ChampionMetrics:
+def _metrics(evidence: CaseCosts) -> dict[str, Any]:
     mean_cost = float(np.mean([cost for _, cost in evidence.cases.values()]))
-    guards = {name: figure for name, figure in evidence.guards.items() if np.isfinite(figure)}
-    return ChampionMetrics(evidence.panel, mean_cost if np.isfinite(mean_cost) else None, guards)
+    return {
+        "panel": evidence.panel,
+        "mean_cost": mean_cost if np.isfinite(mean_cost) else None,
+        "guards": {name: figure for name, figure in evidence.guards.items() if np.isfinite(figure)},
+    }
 
 
 def find_missing_certificate(loop: NightlyLoop, contestant: str) -> str:
-    """Why a challenger of the temperature loop that passes the page's rules has no certificate; empty where
-    it has one, and where the project has no stage that certifies."""
+    """Why a challenger of the temperature loop that passes the page's rules has no certificate; empty if it
+    has one, and if the project has no stage that certifies."""
     if not _asks_for_one(loop):
         return ""
     if not artifacts.exists(CERTIFICATE):
@@ -161,18 +155,12 @@ def find_missing_certificate(loop: NightlyLoop, contestant: str) -> str:
         return f"no certificate: that of {CERTIFYING} is of {shown.get('controller')}, not of {contestant}"
     if shown.get("verdict") != "passed":
         return f"certificate refused by its rule {str(shown.get('first_failed')).replace('_', ' ')}"
-    if lacking := champion.missing(CERTIFIED):
-        return f"no certified controller: {lacking[0]} is missing"
-    return ""
-
-
-def list_certified(loop: NightlyLoop) -> list[str]:
-    """The files of a certified controller that are there, for the champion's folder."""
-    return [path for path in CERTIFIED if _asks_for_one(loop) and Path(path).is_file()]
+    lacking = champion.missing(CERTIFIED)
+    return f"no certified controller: {lacking[0]} is missing" if lacking else ""
 
 
 def _asks_for_one(loop: NightlyLoop) -> bool:
-    """Whether a loop's champion needs a certificate: that of the temperature loop, where the project has the
+    """Whether a loop's champion needs a certificate: that of the temperature loop, if the project has the
     stage that certifies."""
     return loop.judge == "temperature" and CERTIFYING in read_stages("dvc.yaml")
 
@@ -189,7 +177,10 @@ def _candidate(
         evidence = judging.measure(Path("datasets"), verdict.subject)
     except ValueError as reason:
         return decision._replace(reasons=[why, f"not measured: {reason}"]), None
-    guards = {name: records.Guard(None, figure, None) for name, figure in evidence.guards.items()}
+    guards = {
+        name: {"champion": None, "challenger": figure, "allowed": None}
+        for name, figure in evidence.guards.items()
+    }
     return decision._replace(guards=guards), _metrics(evidence)
 
 
@@ -197,23 +188,27 @@ def _candidate(
 
 
 def _place(
-    settings: Nightly, name: str, night: Night, state: ChampionState, judged: JudgedLoop, lineage: Lineage
+    settings: Nightly,
+    name: str,
+    night: Night,
+    state: ChampionState,
+    judged: JudgedLoop,
+    lineage: Mapping[str, Any],
 ) -> ChampionState:
     """The state with a challenger in production or as the candidate; its files lie in that folder then."""
     decision, metrics = judged
-    files, verdict, waits = list_files(settings.loops[name]), decision.verdict, not decision.promotes
+    loop, verdict, waits = settings.loops[name], decision.verdict, not decision.promotes
+    files, why = list_files(loop), "; ".join(decision.reasons)
     before = state.candidates.get(name) if waits else None
     if before and champion.same(before.files, files):
-        folder, md5s, run, when = before.folder, before.files, before.run, before.when
-        lineage = before.lineage
+        one = before._replace(why=why, metrics=metrics)
     else:
-        reference = None if waits else screening.reference(settings.loops[name], Path("datasets"))
+        reference = None if waits else screening.reference(loop, Path("datasets"))
         beside = {screening.REFERENCE: reference} if reference else {}
-        folder, md5s = champion.install(
-            candidate_of(name) if waits else name, [*files, *list_certified(settings.loops[name])], beside
-        )
-        run, when = night.run, night.when
-    one = Champion(run, when, "; ".join(decision.reasons), folder, md5s, metrics, lineage)
+        certified = [path for path in CERTIFIED if _asks_for_one(loop) and Path(path).is_file()]
+        folder = candidate_of(name) if waits else name
+        pointer, md5s = champion.install(folder, [*files, *certified], beside)
+        one = Champion(night.run, night.when, why, pointer, md5s, metrics, lineage)
     if verdict:
         one = one._replace(contestant=verdict.subject, rehearsal=verdict.rehearsal, verdict=verdict.sentence)
     if waits:

@@ -1,10 +1,11 @@
 """The records of the nightly job: what a night found of drift, what is in production, and what was decided.
 
-.beadline/nights.json, reports/metrics/nightly.json and champion.json hold them, and the page reads them.
+.beadline/memory.json, reports/metrics/nightly.json and champion.json hold them, and the page reads them.
 """
 
+import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import pydantic
@@ -18,7 +19,9 @@ R = TypeVar("R")
 def to_json(value: Any) -> Any:
     """A record as JSON: its fields by name, tuples as lists. JSON knows no infinity: it is null."""
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        return {name: to_json(field) for name, field in value._asdict().items()}
+        value = value._asdict()
+    elif dataclasses.is_dataclass(value):
+        value = vars(value)
     if isinstance(value, Mapping):
         return {name: to_json(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -60,100 +63,27 @@ class Alarm(NamedTuple):
     channel: str = ""
 
 
-class ParameterChange(NamedTuple):
-    """Change of one parameter of the plant in percent, half of its 90 % band in percent, and in sigmas."""
-
-    percent: float
-    band_percent: float
-    sigmas: float
+def sort_alarms(alarms: Sequence[Alarm]) -> list[Alarm]:
+    """A sensor that stands still first."""
+    return sorted(alarms, key=lambda alarm: alarm.kind != SENSOR)
 
 
-class InnovationChange(NamedTuple):
-    """Of one output: by how much its noise has grown in percent, and by how many °C of its steady level it is
-    off what the model expects of it; both also in sigmas."""
+@dataclasses.dataclass
+class NightDrift:
+    """What new recordings say of the machines and cameras: alarms, what would be one if it stayed, and why
+    recordings were set aside; notes.
 
-    noise_percent: float
-    noise_sigmas: float
-    mean_degC: float
-    mean_sigmas: float
+    `figures` has what the champion's observer measured on each recording against the champion's own:
+    `parameters` of the plant {percent, band_percent (half of the 90 % band), sigmas}; `innovation` of each
+    output {noise_percent, noise_sigmas, mean_degC, mean_sigmas}; `closed_loop` {moved, sigmas};
+    `not_applicable`, why the closed loop was not asked; `least`, the smallest changes that would have shown.
+    """
 
-
-class ClosedLoopChange(NamedTuple):
-    """By how much a figure of the closed loop has moved, in its own unit and in sigmas."""
-
-    moved: float
-    sigmas: float
-
-
-class RecordingFigures(NamedTuple):
-    """What the champion's observer measured on one recording, against the champion's own: by parameter of the
-    plant, by output, and by figure of the closed loop. `not_applicable` is why the closed loop was not asked,
-    empty where it was. `least` says the smallest changes that the recording could have shown."""
-
-    parameters: Mapping[str, ParameterChange]
-    innovation: Mapping[str, InnovationChange] = {}
-    closed_loop: Mapping[str, ClosedLoopChange] = {}
-    not_applicable: str = ""
-    least: str = ""
-
-
-class LoopDrift(NamedTuple):
-    """Of one loop: alarms, what would be one if it stayed, and the plant's figures by recording.
-    `quarantined` has the reason of each recording that was set aside."""
-
-    loop: str
-    alarms: list[Alarm]
-    watched: list[Alarm]
-    figures: dict[str, RecordingFigures]
-    quarantined: dict[str, str]
-    notes: list[str]
-
-    @classmethod
-    def none(cls, loop: str) -> "LoopDrift":
-        return cls(loop, [], [], {}, {}, [])
-
-
-class NightDrift(NamedTuple):
-    """Drift of every loop of a night. What is said of a loop is read off its own entry, `of(loop)`."""
-
-    loops: dict[str, LoopDrift]
-
-    def of(self, loop: str) -> LoopDrift:
-        return self.loops.get(loop) or LoopDrift.none(loop)
-
-    @property
-    def alarms(self) -> list[Alarm]:
-        """A sensor that stands still first."""
-        alarms = [alarm for drift in self.loops.values() for alarm in drift.alarms]
-        return sorted(alarms, key=lambda alarm: alarm.kind != SENSOR)
-
-    @property
-    def watched(self) -> list[Alarm]:
-        return [alarm for drift in self.loops.values() for alarm in drift.watched]
-
-    @property
-    def figures(self) -> dict[str, RecordingFigures]:
-        return {path: figures for drift in self.loops.values() for path, figures in drift.figures.items()}
-
-    @property
-    def quarantined(self) -> dict[str, str]:
-        return {path: reason for drift in self.loops.values() for path, reason in drift.quarantined.items()}
-
-    @property
-    def notes(self) -> list[str]:
-        return [note for drift in self.loops.values() for note in drift.notes]
-
-    def metrics(self) -> dict[str, Any]:
-        """As reports/metrics/nightly.json has it."""
-        return to_json({"alarms": self.alarms, "watched": self.watched, "figures": self.figures})
-
-
-class RecordShare(NamedTuple):
-    """The shares of a new recording in percent of its samples: used in learning; masked by `ingest`; cut."""
-
-    used_percent: float
-    masked_percent: float
-    cut_percent: float
+    alarms: list[Alarm] = dataclasses.field(default_factory=list)
+    watched: list[Alarm] = dataclasses.field(default_factory=list)
+    figures: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
+    quarantined: dict[str, str] = dataclasses.field(default_factory=dict)
+    notes: list[str] = dataclasses.field(default_factory=list)
 
 
 # ---- production: champion.json
@@ -166,32 +96,14 @@ def candidate_of(loop: str) -> str:
     return f"{loop}.candidate"
 
 
-class Lineage(NamedTuple):
-    """What a champion was made from: the commit, and what lay uncommitted on it. Then SHA-256 of dvc.lock, of
-    the files of parameters, and of each loop's recordings by path."""
-
-    commit: str = ""
-    uncommitted: tuple[str, ...] = ()
-    dvc_lock: str = ""
-    params: Mapping[str, str] = {}
-    recordings: Mapping[str, Mapping[str, str]] = {}
-
-
-class ChampionMetrics(NamedTuple):
-    """What the judge measured of a champion when it was promoted: the panel's name, mean cost of its cases
-    (None if one of them fails), and {guard: figure}."""
-
-    panel: str
-    mean_cost: float | None
-    guards: Mapping[str, float]
-
-
 class Champion(NamedTuple):
     """One loop's champion, or a candidate: the night that made it, when and why; what DVC's pointer says of
-    its folder, and MD5 of its files by path; figures and lineage. `since` is the time of a rollback to it.
+    its folder, and MD5 of its files by path. `since` is the time of a rollback to it.
 
-    `contestant` is the controller that runs, by its name on the pages. `rehearsal`: it was judged on
-    simulated data alone. `verdict` is what the page said of it then.
+    `metrics` is what the judge measured: `panel`, `mean_cost` (None if a case fails), `guards`. `lineage` is
+    what it was made from: `commit` and what lay `uncommitted` on it, hashes of `dvc_lock`, `params` and
+    `recordings`. `contestant` is the controller that runs, by its name on the pages. `rehearsal`: it was
+    judged on simulated data alone. `verdict` is what the page said of it then.
     """
 
     run: str
@@ -199,8 +111,8 @@ class Champion(NamedTuple):
     why: str = ""
     folder: Mapping[str, Any] = {}
     files: Mapping[str, str] = {}
-    metrics: ChampionMetrics | None = None
-    lineage: Lineage = Lineage()
+    metrics: Mapping[str, Any] | None = None
+    lineage: Mapping[str, Any] = {}
     since: str = ""
     contestant: str = ""
     rehearsal: bool = False
@@ -243,7 +155,7 @@ class ChampionState(NamedTuple):
         return {**self.champions, **waiting}
 
 
-# ---- decisions
+# ---- nights
 
 PROMOTED, KEPT, FIRST = "promoted", "kept", "first champion"
 CANDIDATE = "candidate"  # of a challenger that does not pass the page's rules of its loop
@@ -251,24 +163,16 @@ CANDIDATE = "candidate"  # of a challenger that does not pass the page's rules o
 FAILED, QUARANTINED, NOTHING_NEW = "failed", "quarantined", "nothing new"
 
 
-class Guard(NamedTuple):
-    """A guard's figure of champion and challenger, less is better, and how much more is allowed. None: there
-    is no champion to compare with, or no figure."""
-
-    champion: float | None
-    challenger: float | None
-    allowed: float | None
-
-
 class LoopDecision(NamedTuple):
-    """What was decided of one loop's challenger, and why: promoted, kept, first champion or candidate.
-    `paired` is the test of challenger against champion, None if they were not compared. `verdict` is the
-    page's on this loop without its rules, None if it has no page."""
+    """What was decided of one loop's challenger, and why: promoted, kept, first champion, candidate or
+    failed. `paired` is the test of challenger against champion, None if they were not compared. `guards` are
+    figures of which less is better, {name: {champion, challenger, allowed}}, None if there is no such figure.
+    `verdict` is the page's on this loop without its rules, None if it has no page."""
 
     decision: str
     reasons: list[str]
     paired: Paired | None = None
-    guards: Mapping[str, Guard] = {}
+    guards: Mapping[str, Mapping[str, float | None]] = {}
     verdict: Verdict | None = None
 
     @property
@@ -276,32 +180,38 @@ class LoopDecision(NamedTuple):
         return self.decision in (PROMOTED, FIRST)
 
 
-class Night(NamedTuple):
+@dataclasses.dataclass
+class Night:
     """One night: its number, name and time; how it ended and why, and what else is to be said.
 
-    New recordings by loop, and how much of them was used; drift; the reason of each recording that was set
-    aside. What was decided of each loop, and which were promoted. The commit, whether its artifacts have yet
-    to reach the remote, and how long the night took in s. The branch that its promotions wait on, empty if
-    they are in production. `idle`: nights in a row without a new recording, this one among them.
+    New recordings by loop, and {path: {used_percent, masked_percent, cut_percent}} of them; drift. What was
+    decided of each loop. The commit, whether its artifacts have yet to reach the remote, and how long the
+    night took in s. The branch that its promotions wait on, empty if they are in production. `idle`: nights
+    in a row without a new recording, this one among them.
     """
 
     number: int
     run: str
     when: str
     outcome: str = ""
-    reasons: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    new_recordings: Mapping[str, list[str]] = {}
-    used: Mapping[str, RecordShare] = {}
-    drift: NightDrift = NightDrift({})
-    quarantined: Mapping[str, str] = {}
-    decisions: Mapping[str, LoopDecision] = {}
-    promoted: tuple[str, ...] = ()
+    reasons: list[str] = dataclasses.field(default_factory=list)
+    notes: list[str] = dataclasses.field(default_factory=list)
+    new_recordings: dict[str, list[str]] = dataclasses.field(default_factory=dict)
+    used: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
+    drift: NightDrift = dataclasses.field(default_factory=NightDrift)
+    decisions: dict[str, LoopDecision] = dataclasses.field(default_factory=dict)
     commit: str = ""
     unpushed: bool = False
     seconds: float = 0.0
     branch: str = ""
     idle: int = 0
+
+    def end(self, outcome: str, *reasons: str) -> None:
+        self.outcome, self.reasons = outcome, list(reasons)
+
+    @property
+    def promoted(self) -> list[str]:
+        return [name for name, decision in self.decisions.items() if decision.promotes]
 
     @property
     def lost(self) -> list[str]:
@@ -311,59 +221,42 @@ class Night(NamedTuple):
     @property
     def candidates(self) -> dict[str, str]:
         """The loops whose challenger is a candidate, and what the page says of each."""
-        return {
-            name: "; ".join(decision.reasons)
-            for name, decision in self.decisions.items()
-            if decision.decision == CANDIDATE
-        }
-
-    def noted(self, *notes: str) -> "Night":
-        return self._replace(notes=(*self.notes, *notes))
-
-    def ended(self, outcome: str, *reasons: str) -> "Night":
-        return self._replace(outcome=outcome, reasons=reasons)
+        waiting = {name: one for name, one in self.decisions.items() if one.decision == CANDIDATE}
+        return {name: "; ".join(decision.reasons) for name, decision in waiting.items()}
 
     def metrics(self, state: ChampionState) -> dict[str, Any]:
         """As reports/metrics/nightly.json has it, with what is in production."""
+        keys = ("run", "when", "why", "contestant", "rehearsal")
         production, candidates = (
-            {
-                name: {key: getattr(one, key) for key in ("run", "when", "why", "contestant", "rehearsal")}
-                for name, one in champions.items()
-            }
+            {name: {key: getattr(one, key) for key in keys} for name, one in champions.items()}
             for champions in (state.champions, state.candidates)
         )
-        fields = to_json(self._replace(drift=NightDrift({})))
-        named = {"decision": self.outcome, "night": self.number, "drift": self.drift.metrics()}
-        return fields | named | {"champion": production, "candidates": candidates}
+        named = {"decision": self.outcome, "night": self.number, "promoted": self.promoted}
+        return to_json(self) | named | {"champion": production, "candidates": candidates}
 
 
-# ---- memory
+@dataclasses.dataclass
+class Memory:
+    """What the job remembers from night to night, .beadline/memory.json: the last night's number, the time of
+    the last success (empty before the first), the digest of all that it was made from, whether its artifacts
+    have yet to reach the remote, and `idle` as of a night.
 
-
-class DriftMemory(NamedTuple):
-    """Of the last night with recordings: keys of what was watched or raised an alarm, and its alarms.
-    `drifted` are the recordings of each loop since its alarm; `night` is 0 before the first. `recent` is what
-    the last nights named of each loop: {loop: {"reference": digest of what they were held against, "nights":
-    [{change: [size, standard deviation]}]}}, over which a change is pooled; "seeming" is the same of
-    what nights left unnamed."""
-
-    pending: tuple[str, ...] = ()
-    alarms: tuple[Alarm, ...] = ()
-    drifted: Mapping[str, list[str]] = {}
-    night: int = 0
-    recent: Mapping[str, Mapping[str, Any]] = {}
-
-
-class Remembered(NamedTuple):
-    """The last night: its number, time of the last success (empty before the first), and the digest of all
-    that it was made from. `unpushed`: its artifacts have yet to reach the remote. `recordings` is {loop:
-    {path: digest}}; `hashes` is {path: [size, time of change, inode, digest]}; `idle` as of a night."""
+    `recordings` is {loop: {path: digest}}; `hashes` is {path: [size, time of change, inode, digest]};
+    `nights` is every night, the oldest first. Of the last night with recordings: its alarms, and the keys
+    that it watched or alarmed (`pending`). `drifted` are the recordings of each loop since its alarm.
+    `recent` is what the last nights named of each loop, over which a change is pooled: {loop: {"reference":
+    digest of what they were held against, "nights": [{change: [size, standard deviation]}]}}.
+    """
 
     night: int = 0
     success: str = ""
     inputs: str = ""
     unpushed: bool = False
-    recordings: Mapping[str, Mapping[str, str]] = {}
-    drift: DriftMemory = DriftMemory()
-    hashes: Mapping[str, list[int | str]] = {}
     idle: int = 0
+    recordings: dict[str, dict[str, str]] = dataclasses.field(default_factory=dict)
+    hashes: dict[str, list[int | str]] = dataclasses.field(default_factory=dict)
+    nights: list[Night] = dataclasses.field(default_factory=list)
+    alarms: list[Alarm] = dataclasses.field(default_factory=list)
+    pending: list[str] = dataclasses.field(default_factory=list)
+    drifted: dict[str, list[str]] = dataclasses.field(default_factory=dict)
+    recent: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)

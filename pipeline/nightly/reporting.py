@@ -1,7 +1,6 @@
 """How a night is told: what is remembered of it, its page, the alarm or the heartbeat, and one line. None of
 these may hide the others, nor a mistake of this program the night."""
 
-import contextlib
 import datetime
 import html
 import traceback
@@ -12,7 +11,7 @@ import numpy as np
 
 from pipeline.nightly import champion, records, remembered, watch
 from pipeline.nightly.processes import STATE
-from pipeline.nightly.records import ChampionState, Night, Remembered, to_json
+from pipeline.nightly.records import ChampionState, Memory, Night, to_json
 from pipeline.nightly.settings import Nightly
 from pipeline.store import artifacts, params
 
@@ -43,12 +42,8 @@ def tell(error: Exception, run: str) -> str:
     return f"a mistake of this program ({type(error).__name__}: {sentence}); {where}; please report it"
 
 
-# ---- the report
-
-
-def report(night: Night, memory: Remembered, settings: Nightly | None, render: Render) -> tuple[int, str]:
-    """State, page, alarm or heartbeat; the exit status and the summary. `memory` is what is remembered,
-    `render` makes the page."""
+def report(night: Night, memory: Memory, settings: Nightly | None, render: Render) -> tuple[int, str]:
+    """Memory, page, alarm or heartbeat; the exit status and the summary. `render` makes the page."""
     troubles: list[str] = []
 
     def attempt(part: Callable[[], None]) -> bool:
@@ -59,9 +54,12 @@ def report(night: Night, memory: Remembered, settings: Nightly | None, render: R
             troubles.append(tell(error, night.run))
             return False
 
-    attempt(lambda: remembered.remember(memory, night))
+    memory.nights.append(night)
+    attempt(lambda: remembered.write(memory))
     made = night.outcome == records.NOTHING_NEW and PAGE.exists()
-    if not made and not (settings and attempt(lambda: _write_page(night.noted(*troubles), settings, render))):
+    if not made and not (
+        settings and attempt(lambda: _write_page(night, troubles, memory, settings, render))
+    ):
         attempt(lambda: artifacts.write_text(PAGE, render_plainly(night, troubles)))
     status = FAILED if troubles else exit_status(night)
     routes = watch.find_routes(settings)
@@ -70,20 +68,23 @@ def report(night: Night, memory: Remembered, settings: Nightly | None, render: R
     if status != OK:
         kind, reasons = _alarm(night, status, troubles)
         details = {
-            "night": night.run,
-            "when": night.when,
-            "status": status,
-            "drift": night.drift.metrics(),
-            "quarantined": to_json(night.quarantined),
+            "drift": to_json(night.drift),
+            "quarantined": night.drift.quarantined,
             "log": f".beadline/logs/{night.run}.log",
         }
-        troubles += watch.wake(kind, reasons, details, routes)
+        troubles += watch.wake(kind, reasons, _details(night, status) | details, routes)
     return status, summarise(night, troubles)
 
 
-def _write_page(night: Night, settings: Nightly, render: Render) -> None:
-    nights = [*(earlier for earlier in remembered.nights() if earlier.number != night.number), night]
-    artifacts.write_text(PAGE, render(nights, champion.read(), watch.hide_secrets(settings)))
+def _write_page(
+    night: Night, troubles: Sequence[str], memory: Memory, settings: Nightly, render: Render
+) -> None:
+    night.notes += troubles
+    artifacts.write_text(PAGE, render(memory.nights, champion.read(), watch.hide_secrets(settings)))
+
+
+def _details(night: Night, status: int) -> dict[str, str | int]:
+    return {"night": night.run, "when": night.when, "status": status}
 
 
 def render_plainly(night: Night, troubles: Sequence[str]) -> str:
@@ -105,12 +106,12 @@ def exit_status(night: Night) -> int:
         return FAILED
     if night.drift.alarms:
         return DRIFTED
-    return QUARANTINED if night.quarantined else OK
+    return QUARANTINED if night.drift.quarantined else OK
 
 
 def _alarm(night: Night, status: int, troubles: Sequence[str]) -> tuple[str, list[str]]:
     """What somebody is woken for, and all of why: the gravest hides none of the others."""
-    drift, aside = [alarm.cause for alarm in night.drift.alarms], list(night.quarantined.values())
+    drift, aside = [alarm.cause for alarm in night.drift.alarms], list(night.drift.quarantined.values())
     if status == FAILED:
         lost = [f"{name}: {night.decisions[name].reasons[0]}" for name in night.lost]
         own = night.reasons if night.outcome == records.FAILED else lost
@@ -132,20 +133,14 @@ def summarise(night: Night, troubles: Sequence[str]) -> str:
     rest = [why for why in night.reasons if why not in waiting]
     if rest and (not (night.promoted or alarms) or night.lost or night.outcome == records.FAILED):
         parts.append("; ".join(rest))
-    if night.quarantined:
-        parts.append("quarantined: " + "; ".join(night.quarantined.values()))
-    parts += [say_share(path, share) for path, share in list(night.used.items())[:MOST_RECORDS]]
+    if night.drift.quarantined:
+        parts.append("quarantined: " + "; ".join(night.drift.quarantined.values()))
+    for path, share in list(night.used.items())[:MOST_RECORDS]:
+        lost = [word for word in ("masked", "cut") if share[f"{word}_percent"] >= 1]
+        parts.append(", ".join([f"used {share['used_percent']:.0f} % of {Path(path).name}", *lost]))
     sentences = dict.fromkeys([*parts, *night.notes, *troubles])
     text = " ".join(" | ".join([*sentences, f"{night.seconds:g} s"]).split())
     return text if len(text) <= 1000 else text[:999] + "…"
-
-
-def say_share(path: str, share: records.RecordShare) -> str:
-    """ "used 61 % of shift_12.mcap, cut"."""
-    lost = [
-        word for word, part in (("masked", share.masked_percent), ("cut", share.cut_percent)) if part >= 1
-    ]
-    return ", ".join([f"used {share.used_percent:.0f} % of {Path(path).name}", *lost])
 
 
 # ---- when there is no night
@@ -154,11 +149,10 @@ def say_share(path: str, share: records.RecordShare) -> str:
 def last_resort(error: Exception, now: datetime.datetime) -> tuple[int, str]:
     """Exit status and summary of a night that could not be begun or reported; somebody is woken all the same,
     by whatever is known."""
-    why = tell(error, "nightly")
+    night = Night(0, "nightly", watch.stamp(now))
+    night.end(records.FAILED, tell(error, "nightly"))
     settings, _ = load_settings()
-    details = {"night": "nightly", "when": watch.stamp(now), "status": FAILED}
-    troubles = watch.wake("failed", [why], details, watch.find_routes(settings))
-    night = Night(0, "nightly", watch.stamp(now)).ended(records.FAILED, why)
+    troubles = watch.wake("failed", night.reasons, _details(night, FAILED), watch.find_routes(settings))
     try:
         artifacts.write_text(PAGE, render_plainly(night, troubles))
     except Exception as unwritten:
@@ -179,17 +173,15 @@ def watchdog(now: datetime.datetime | None = None) -> tuple[int, str]:
     The alarm goes out with it. Takes no lock: a night that hangs is seen too."""
     now = now or datetime.datetime.now(datetime.UTC)
     settings, reasons = load_settings()
-    last = Remembered()
+    success = ""
     try:
         champion.read()
-        reasons += remembered.check()
-        with contextlib.suppress(ValueError, KeyError, TypeError):  # broken, which is a reason already
-            last = remembered.last()
-        if settings and not reasons:
-            reasons += filter(None, [watch.find_overdue(now, last.success, settings.watch_h)])
+        success = remembered.read().success
+        if settings:
+            reasons += filter(None, [watch.find_overdue(now, success, settings.watch_h)])
     except Exception as error:  # a watchdog that dies would be the most silent of all
         reasons.append(tell(error, "watch"))
     if not reasons:
-        return OK, f"nightly: watch: the last success was at {last.success}"
+        return OK, f"nightly: watch: the last success was at {success}"
     troubles = watch.wake("watch", reasons, {"when": watch.stamp(now)}, watch.find_routes(settings))
     return FAILED, " | ".join([f"nightly: watch: {'; '.join(reasons)}", *troubles])

@@ -1,51 +1,51 @@
 """`dvc repro` by loop, in the copy: a stage that fails stops what follows from it, and no other loop."""
 
 import contextlib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 
-from pipeline.nightly.processes import TooLongError, dvc, find_sentence, git
+from pipeline.nightly.processes import TooLongError, dvc, git
 from pipeline.nightly.settings import NightlyLoop
 from pipeline.store import artifacts
 
 
-class Wiring(NamedTuple):
-    """What dvc.yaml says: of each stage all that it depends on, near and far, itself among it; and of each
-    loop the stages that its artifacts depend on."""
-
-    upstream: Mapping[str, frozenset[str]]
-    of_loop: Mapping[str, frozenset[str]]
-
-    def loops(self, stage: str) -> set[str]:
-        """The loops that a stage belongs to: whose artifacts depend on it, or on which it depends itself. A
-        page of all belongs to every loop."""
-        return {
-            name
-            for name, stages in self.of_loop.items()
-            if stage in stages or stages & self.upstream.get(stage, frozenset())
-        }
-
-
-def read_wiring(loops: Mapping[str, NightlyLoop]) -> Wiring:
-    """Read off dvc.yaml."""
-    stages = read_stages("dvc.yaml")
-    made = {out: name for name, stage in stages.items() for out in outs_of(stage)}
-    reads = {
-        name: {maker for dep in stage.get("deps", []) for out, maker in made.items() if _overlap(dep, out)}
-        for name, stage in stages.items()
-    }
-    upstream = {name: _upstream(name, reads) for name in stages}
-    of_loop = {
-        name: frozenset().union(
-            *(upstream[made[out]] for path in loop.artifacts for out in made if _overlap(path, out))
-        )
-        for name, loop in loops.items()
-    }
-    return Wiring(upstream, of_loop)
+def reproduce(
+    loops: Mapping[str, NightlyLoop], log: Path, *, limit_s: float
+) -> tuple[dict[str, str], list[str]]:
+    """Runs the stages: {loop: why it failed}, and what else is to be said. What a loop that failed has made
+    is as it was before the night, and pages of several loops are made of that. Raises ValueError if no loop
+    went well, or a stage of all of them failed, and TooLongError if the stages take longer than `limit_s`."""
+    try:
+        dvc("repro", "--keep-going", log=log, limit_s=limit_s)
+        return {}, []
+    except TooLongError:
+        raise
+    except ValueError as error:
+        failure = error
+    upstream = read_upstream()
+    loops_of = _find_loops(loops, upstream)
+    lost: dict[str, str] = {}
+    for name in loops:
+        stages = [stage for stage, several in loops_of.items() if name in several and several != {*loops}]
+        try:
+            if stages:  # what is made already takes no time, and what failed says why
+                dvc("repro", *stages, log=log.with_suffix(f".{name}.log"), limit_s=limit_s)
+        except ValueError as error:
+            lost[name] = str(error)
+    if not lost or len(lost) == len(loops):
+        raise failure
+    own = {stage for stage, several in loops_of.items() if several and several <= lost.keys()}
+    _undo(own)
+    shared = [stage for stage in upstream if stage not in own and upstream[stage] & own]
+    try:
+        if shared:
+            dvc("repro", "--single-item", "--keep-going", *shared, log=log.with_suffix(".shared.log"))
+        return lost, []
+    except ValueError as error:
+        return lost, [f"{', '.join(shared)} could not be made, and are those of the last good run: {error}"]
 
 
 def read_stages(path: str) -> dict[str, Any]:
@@ -67,77 +67,44 @@ def outs_of(stage: Mapping[str, Any]) -> list[str]:
     return [name for entry in entries for name in (entry if isinstance(entry, dict) else [entry])]
 
 
-def _overlap(path: str, out: str) -> bool:
-    """Whether one of the two paths lies in the other, or is it."""
-    return f"{path}/".startswith(f"{out}/") or f"{out}/".startswith(f"{path}/")
+def read_upstream() -> dict[str, set[str]]:
+    """Of each stage of dvc.yaml all that it depends on, near and far, itself among it."""
+    stages = read_stages("dvc.yaml")
+    reads = {name: _find_makers(stages, stage.get("deps", [])) for name, stage in stages.items()}
+    upstream = {name: {name} for name in stages}
+    for _ in stages:  # no chain is longer
+        upstream = {name: {name}.union(*(upstream[maker] for maker in reads[name])) for name in stages}
+    return upstream
 
 
-def _upstream(stage: str, reads: Mapping[str, set[str]]) -> frozenset[str]:
-    stages, waiting = set(), [stage]
-    while waiting:
-        name = waiting.pop()
-        if name not in stages:
-            stages.add(name)
-            waiting += reads[name]
-    return frozenset(stages)
-
-
-# ---- the run
-
-
-def reproduce(loops: Mapping[str, NightlyLoop], log: Path, *, limit_s: float) -> tuple[dict[str, str], list]:
-    """{loop: why its stages failed}, and notes. The files of a loop whose stages failed are as they were
-    before the night. Raises ValueError if every loop failed, a stage of no loop, or dvc itself, and if the
-    stages take longer than `limit_s`."""
-    try:
-        dvc("repro", "--keep-going", log=log, limit_s=limit_s)
-        return {}, []
-    except TooLongError:
-        raise  # no stage is to blame by what it printed
-    except ValueError:
-        if not (failed := _failed(wiring := read_wiring(loops))):
-            raise
-    text = log.read_text(encoding="utf-8", errors="replace")
-    lost: dict[str, str] = {}
-    for stage in failed:
-        why = f"dvc repro failed: {_why(text, stage)}"
-        touched = wiring.loops(stage)
-        if not touched or touched == set(loops):
-            raise ValueError(why)
-        lost |= dict.fromkeys(sorted(touched - lost.keys()), why)
-    if len(lost) == len(loops):
-        raise ValueError("; ".join(dict.fromkeys(lost.values())))
-    own = [stage for stage in wiring.upstream if wiring.loops(stage) and wiring.loops(stage) <= lost.keys()]
-    _undo(own)
-    # what belongs to several loops, such as the pages: of the loops that went well, and the others as before
-    shared = [
-        stage
-        for stage in wiring.upstream
-        if stage not in own and wiring.loops(stage) & lost.keys() and wiring.upstream[stage] & {*failed}
-    ]
-    try:
-        if shared:
-            dvc("repro", "--single-item", "--keep-going", *shared, log=log.with_suffix(".shared.log"))
-        return lost, []
-    except ValueError as error:
-        return lost, [f"{', '.join(shared)} could not be made, and are those of the last good run: {error}"]
-
-
-def _failed(wiring: Wiring) -> list[str]:
-    """The stages that failed: not up to date, though all that they depend on is."""
-    printed = dvc("status", "--json", *wiring.upstream)
-    stale = json.loads(next(line for line in reversed(printed.splitlines()) if line.startswith("{")))
-    return [
+def _find_makers(stages: Mapping[str, Any], paths: Sequence[str]) -> set[str]:
+    """The stages with an out that lies at one of these paths, in it or around it."""
+    return {
         name
-        for name in wiring.upstream
-        if name in stale and not stale.keys() & wiring.upstream[name] - {name}
-    ]
+        for name, stage in stages.items()
+        for out in outs_of(stage)
+        for path in paths
+        if f"{path}/".startswith(f"{out}/") or f"{out}/".startswith(f"{path}/")
+    }
 
 
-def _undo(stages: Sequence[str]) -> None:
+def _find_loops(loops: Mapping[str, NightlyLoop], upstream: Mapping[str, set[str]]) -> dict[str, set[str]]:
+    """{stage: the loops it belongs to}: those whose artifacts depend on it, or on which it depends. A page of
+    all belongs to every loop."""
+    stages = read_stages("dvc.yaml")
+    needed = {
+        name: set().union(*(upstream[maker] for maker in _find_makers(stages, loop.artifacts)))
+        for name, loop in loops.items()
+    }
+    return {
+        stage: {name for name, makers in needed.items() if stage in makers or makers & upstream[stage]}
+        for stage in upstream
+    }
+
+
+def _undo(stages: set[str]) -> None:
     """What these stages wrote is as it was before the night: dvc.lock, the files that git keeps, outs."""
-    lock = git("show", "HEAD:dvc.lock", check=False)
-    before = (yaml.safe_load(lock) or {}).get("stages", {}) if lock else {}
+    before = (yaml.safe_load(git("show", "HEAD:dvc.lock", check=False)) or {}).get("stages", {})
     entries = {name: entry for name, entry in read_stages("dvc.lock").items() if name not in stages}
     entries |= {name: before[name] for name in stages if name in before}
     text = yaml.safe_dump({"schema": "2.0", "stages": entries}, sort_keys=False, allow_unicode=True)
@@ -148,16 +115,3 @@ def _undo(stages: Sequence[str]) -> None:
     if known := [name for name in stages if name in before]:
         with contextlib.suppress(ValueError):  # what is in no cache is made by the next repro
             dvc("checkout", "--quiet", "--force", *known)
-
-
-def _why(text: str, stage: str) -> str:
-    """What was printed of a stage's failure; the stage's own sentence if it has one."""
-    parts = text.replace("\r", "\n").split("Running stage '")
-    own = next((part for part in parts if part.startswith(f"{stage}'")), "")
-    if not own:  # it was not even begun: an input is missing
-        lines = [line for line in text.splitlines() if line.startswith("WARNING: ") and "skipped" not in line]
-        return f"{stage}: {lines[-1].removeprefix('WARNING: ')}" if lines else find_sentence(text)
-    lines = own.splitlines()
-    end = next((k for k, line in enumerate(lines) if line.startswith("WARNING: failed to run")), len(lines))
-    said = [line.replace("WARNING: failed", "ERROR: failed") for line in lines[1 : end + 1]]
-    return find_sentence("\n".join([f"Running stage '{stage}':", *said]))

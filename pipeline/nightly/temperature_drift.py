@@ -13,15 +13,7 @@ from pipeline.nightly.baseline import Baseline
 from pipeline.nightly.camera_drift import CameraChange
 from pipeline.nightly.drift import CauseFit, DriftCause, DriftRecord, Explanation, ProductionModel, Segments
 from pipeline.nightly.inputs import quarantine
-from pipeline.nightly.records import (
-    SENSOR,
-    Alarm,
-    ClosedLoopChange,
-    InnovationChange,
-    LoopDrift,
-    ParameterChange,
-    RecordingFigures,
-)
+from pipeline.nightly.records import SENSOR, Alarm, Memory, NightDrift
 from pipeline.nightly.settings import DriftLimits, NightlyLoop
 from pipeline.store import artifacts, params
 from pipeline.temperature.identification import model_choice
@@ -35,9 +27,6 @@ NIGHTS = 12  # of the champion's own recordings that a new one is held against
 AHEAD = 2.0
 LONGEST = 7200  # samples of a record that are asked, its last ones
 POOLED = 3  # nights over which an estimate is pooled
-# sigmas from which on nights that each leave a change unnamed name it together; it is past its limit besides
-TOGETHER = 4.0
-CONTRADICTED = 9.0  # squares of deviations from their mean, for each night but one: beyond, they disagree
 # several nights tell how the air around scatters from one to the next, pieces of one do not
 NIGHTS_FLOORS, PIECES_FLOORS = baseline.Floors(0.03, 0.25), baseline.Floors(0.2, 2.0)
 # mean offset of the champion's own nights, in units of drift.offset_degC, up to which they count as a
@@ -46,6 +35,7 @@ SETTLED = 5.0
 FOLDS = 4  # models that are identified without some of the champion's nights
 # no machine changes by more within a night: then the record is in doubt
 MOST_GAIN_PERCENT, MOST_OFFSET_DEGC = 80.0, 50.0
+FELL_PERCENT = -60.0  # a heater that gives so much less looks like commands that are written too large
 ROOM_DEGC, COLDEST_DEGC, HOTTEST_DEGC = 20.0, -30.0, 60.0  # of the champion's nights; of any room
 UNEXPLAINED = 3.0  # by so much more than an honest record may leave, a record leaves what no cause explains
 LIKELY, WORTH_NAMING = 4.0, 1.5  # times that a record fits better with a mistake undone
@@ -56,47 +46,33 @@ PARTS = 4  # of a record, whose scatter tells how well its closed-loop figures a
 class ProductionReference(NamedTuple):
     """What the champion's own recordings said of its model, and their closed-loop figures; `steps` (p,) are
     those of the sensors in °C. `digest` is that of reference.json, by which the memory of the nights knows it
-    again."""
+    again. Then the names of the machine's signals, and the limits that changes are held against."""
 
     machine: ProductionModel
     own: Baseline
     loop: list[dict[str, list[list[float]]]]
     steps: np.ndarray
     digest: str
-
-
-class Estimate(NamedTuple):
-    """A change that one night named: size in the unit of its limit, and its standard deviation."""
-
-    amount: float
-    deviation: float
+    inputs: list[str]
+    outputs: list[str]
+    limits: DriftLimits
 
 
 class RecordingChange(NamedTuple):
-    """A change of one recording: kind and channel for a machine to read, words for a person, the estimate and
-    the limit that it is held against."""
+    """A change of one recording: kind and channel for a machine to read, words for a person; size in the unit
+    of its limit, the standard deviation of the size, and the limit."""
 
     kind: str
     channel: str
     words: str
-    estimate: Estimate
+    size: float
+    deviation: float
     limit: float
 
     @property
     def key(self) -> str:
         kind = self.kind.split(" or ")[0]
         return f"{kind} of {self.channel}" if self.channel else kind
-
-
-class NightChanges(NamedTuple):
-    """Of one night, by the key of the change: what it named, and where it named nothing in calm air, what
-    each change would be as if it alone had come about."""
-
-    named: dict[str, Estimate]
-    seeming: dict[str, Estimate]
-
-
-Nights = list[NightChanges]  # the last one last
 
 
 # ---- the champion's own recordings
@@ -152,22 +128,29 @@ def _without_each(machine: Plant, nights: Sequence[Segments]) -> list[Production
     for fold in range(folds):
         others = [pair for k, night in enumerate(nights) if k % folds != fold for pair in night]
         u, y = [pair[0] for pair in others], [pair[1] for pair in others]
-        found = model_choice.identify(
+        model = model_choice.identify(
             u, y, sample_time_s=machine.sample_time_s, settings=settings, names=names
         )
-        models.append(ProductionModel(found.plant, _samples(nights)))
+        models.append(ProductionModel(model.plant, _samples(nights)))
     return [models[k % folds] for k in range(len(nights))]
 
 
-def _read_reference(folder: Path) -> ProductionReference | None:
+def read_reference(folder: Path, machine: Plant, limits: DriftLimits) -> ProductionReference | None:
+    """That of a champion's folder; None if it has none that this version reads."""
     path = folder / REFERENCE
     fields = artifacts.read_json(path) if path.exists() else {}
     if fields.get("version") != baseline.VERSION:
         return None
-    machine = ProductionModel(judge.identified(folder), fields["samples"])
-    steps = np.array(fields.get("steps", [np.inf] * machine.plant.p))
+    model = ProductionModel(judge.identified(folder), fields["samples"])
     return ProductionReference(
-        machine, Baseline.read(fields["own"]), fields["loop"], steps, artifacts.sha256(path)
+        model,
+        Baseline.read(fields["own"]),
+        fields["loop"],
+        np.array(fields.get("steps", [np.inf] * model.plant.p)),
+        artifacts.sha256(path),
+        [signal.name for signal in machine.inputs],
+        [signal.name for signal in machine.outputs],
+        limits,
     )
 
 
@@ -189,493 +172,365 @@ def _samples(nights: Sequence[Segments]) -> int:
 # ---- a night's recordings
 
 
-class SignalNames(NamedTuple):
-    """Names of the machine's signals."""
-
-    inputs: list[str]
-    outputs: list[str]
-
-
 def look(
+    findings: NightDrift,
     limits: DriftLimits,
-    name: str,
+    loop: str,
     folder: str,
     new: Sequence[str],
     champion: Path | None,
-    pending: set[str],
-    recent: Mapping[str, Any],
-) -> tuple[LoopDrift, dict[str, Any] | None]:
-    """Drift of loop `name` by its new recordings below `folder`, against the champion's, and what the next
-    night must remember of this one (see `DriftMemory.recent`); `recent` is what the nights before named. A
-    recording that cannot be read, or is not what it says, is set aside."""
-    drifted = LoopDrift.none(name)
+    memory: Memory,
+) -> dict[str, Any]:
+    """Adds to `findings` what the new recordings below `folder` say of the loop's machine, held against those
+    of its champion; what the next night must remember of this one (see `Memory.recent`). A recording that
+    cannot be read, or is not what it says, is set aside."""
+    recent = memory.recent.get(loop, {})
     if not Path(folder).is_dir():
-        return drifted, None
+        return recent
     machine, broken = recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet"), {}
     records = judge.read_records(Path(folder), machine, broken)
-    for path, reason in broken.items():
-        if f"{folder}/{path}" in new:
-            _silent(drifted, f"{folder}/{path}", reason, [output.name for output in machine.outputs])
-            drifted.quarantined[f"{folder}/{path}"] = quarantine(f"{folder}/{path}", name, reason)
-    good = {
-        path: records[within]
-        for path in new
-        if path not in drifted.quarantined and (within := path.removeprefix(f"{folder}/")) in records
-    }
+    good = {}
+    for path in new:
+        within = path.removeprefix(f"{folder}/")
+        if within in broken:
+            for output in machine.outputs:
+                if f"should hold numbers for {output.name} but all of its" in broken[within]:
+                    _doubt(findings, loop, path, output.name, f"{output.name} gives no number.")
+            findings.quarantined[path] = quarantine(path, loop, broken[within])
+        elif within in records:
+            good[path] = records[within].record
     if champion is None or not good:
-        return drifted, None
-    held = _read_reference(champion)
-    if held is None:
-        drifted.notes.append(
-            f"{name}: the champion has no reference of its own recordings that this version reads: drift was "
+        return recent
+    production = read_reference(champion, machine, limits)
+    if production is None:
+        findings.notes.append(
+            f"{loop}: the champion has no reference of its own recordings that this version reads: drift was "
             "not measured; the next promotion makes one"
         )
-        return drifted, None
-    nights = _nights(recent, held.digest)
-    for path, result in good.items():
-        if _stand_still(drifted, path, result.record, held, machine):
-            continue
-        segments = _last(judge.segments(result.record, machine))
-        if not segments:
-            continue
+        return recent
+    nights = list(recent["nights"]) if recent.get("reference") == production.digest else []
+    for path, record in good.items():
         try:
-            drifted = _one(limits, drifted, path, result.record, held, machine, nights, pending)
+            if not _stand_still(findings, loop, path, record, production, machine):
+                _hold_against(findings, loop, path, record, production, machine, nights, memory.pending)
         except ValueError as error:
-            drifted.notes.append(f"{path}: {error}")
-    recent = {
-        "nights": [_rounded(night.named) for night in nights],
-        "seeming": [_rounded(night.seeming) for night in nights],
-    }
-    return drifted, {"reference": held.digest, **recent}
-
-
-def _nights(recent: Mapping[str, Any], digest: str) -> Nights:
-    """The nights before, where they were held against the same reference."""
-    if recent.get("reference") != digest:
-        return []
-    named = recent.get("nights", [])
-    seeming = recent.get("seeming", [{}] * len(named))
-    return [
-        NightChanges(_estimates(one), _estimates(other)) for one, other in zip(named, seeming, strict=True)
-    ]
-
-
-def _estimates(night: Mapping[str, Sequence[float]]) -> dict[str, Estimate]:
-    return {key: Estimate(*pair) for key, pair in night.items()}
-
-
-def _rounded(night: Mapping[str, Estimate]) -> dict[str, list[float]]:
-    return {key: [round(float(part), 6) for part in estimate] for key, estimate in night.items()}
-
-
-def _least(limits: DriftLimits, explained: Explanation, held: ProductionReference, names: SignalNames) -> str:
-    """The smallest changes of a gain and of an offset that would have been an alarm tonight, of the signal
-    that is known least."""
-    words = []
-    for article, kind, unit in (("a", "gain", "%"), ("an", "offset", "°C")):
-        sizes = {
-            _name(fit.cause, names): _limit(limits, fit.cause)
-            + limits.limit_sigmas * _amount(fit, held, ()).deviation
-            for fit in (*explained.others, *(named.fit for named in explained.named))
-            if fit.cause.kind == kind and fit.cause.channel >= 0
-        }
-        worst = max(sizes, key=sizes.__getitem__)
-        words.append(f"{article} {kind} of {worst} from {sizes[worst]:.1f} {unit} on")
-    return " and ".join(words)
-
-
-def _silent(drifted: LoopDrift, path: str, reason: str, outputs: Sequence[str]) -> None:
-    """An alarm for a recording that cannot be read because a sensor gives no number in it."""
-    for output in outputs:
-        if f"should hold numbers for {output} but all of its" in reason:
-            _doubt(drifted, path, output, f"{output} gives no number.")
+            findings.notes.append(f"{path}: {error}")
+    return {"reference": production.digest, "nights": nights}
 
 
 def _stand_still(
-    drifted: LoopDrift, path: str, record: dict[str, np.ndarray], held: ProductionReference, machine: Plant
+    findings: NightDrift,
+    loop: str,
+    path: str,
+    record: dict[str, np.ndarray],
+    production: ProductionReference,
+    machine: Plant,
 ) -> bool:
     """Whether a sensor gives no number or stands still in a recording: then that is an alarm, the recording
-    is set aside, and nothing else is asked of it. Readings in °F or K are out of limits as well: no alarm."""
+    is set aside, and nothing else is asked of it. Readings in °F or K are out of limits as well: if they are
+    within them with that undone, and fit the model, it is a mistake of the record and no alarm."""
     readings = _last(judge.segments(record, machine, masked=False))
-    noise = np.exp(held.own.noise.mean(axis=0) / 2)
-    found = sensors.faults(held.machine.plant, machine, readings, noise=noise, steps=held.steps)
-    if not found:
+    noise = np.exp(production.own.noise.mean(axis=0) / 2)
+    plant, steps = production.machine.plant, production.steps
+    faults = sensors.faults(plant, machine, readings, noise=noise, steps=steps)
+    if not faults:
         return False
-    if all(fault.kind == sensors.OPEN for fault in found):
-        names = SignalNames([i.name for i in machine.inputs], [o.name for o in machine.outputs])
-        mistake = mistakes.found(held.machine, readings, held.own, inputs=names.inputs, outputs=names.outputs)
-        if mistake:
-            drifted.quarantined[path] = quarantine(path, drifted.loop, f"{path}: {mistake.reason}")
-            return True
-    for fault in found:
-        _doubt(drifted, path, fault.output, fault.sentence)
-    reason = f"{path}: {found[0].sentence} It says nothing of the machine"
-    drifted.quarantined[path] = quarantine(path, drifted.loop, reason)
+    reason = f"{faults[0].sentence} It says nothing of the machine"
+    if all(fault.kind == sensors.OPEN for fault in faults):
+        mistake = mistakes.likeliest(
+            production.machine, readings, production.own, inputs=production.inputs, outputs=production.outputs
+        )
+        fits = mistake.left <= mistakes.honest(production.own)
+        if fits and not sensors.faults(plant, machine, mistake.undone, noise=noise, steps=steps):
+            reason = f"{mistake.words}: undone, the readings are within their limits; mend it and put it back"
+            faults = []
+    for fault in faults:
+        _doubt(findings, loop, path, fault.output, fault.sentence)
+    findings.quarantined[path] = quarantine(path, loop, f"{path}: {reason}")
     return True
 
 
-def _doubt(drifted: LoopDrift, path: str, output: str, sentence: str) -> None:
+def _doubt(findings: NightDrift, loop: str, path: str, output: str, sentence: str) -> None:
     cause = f"{sentence} Check the sensor and its wiring before the machine heats again"
-    key = f"{drifted.loop}: sensor {output}"
-    drifted.alarms.append(Alarm(drifted.loop, key, path, cause, 99.9, (), SENSOR, output))
+    findings.alarms.append(Alarm(loop, f"{loop}: sensor {output}", path, cause, 99.9, (), SENSOR, output))
 
 
-def _one(
-    limits: DriftLimits,
-    drifted: LoopDrift,
+def _hold_against(
+    findings: NightDrift,
+    loop: str,
     path: str,
     record: dict[str, np.ndarray],
-    held: ProductionReference,
+    production: ProductionReference,
     machine: Plant,
-    nights: Nights,
-    pending: set[str],
-) -> LoopDrift:
-    """The loop's drift with what one recording says; it joins `nights`."""
+    nights: list[dict[str, list[float]]],
+    pending: Sequence[str],
+) -> None:
+    """Adds what one recording says of the machine to the findings; its changes join those of `nights`."""
     segments, closed_loop = _last(judge.segments(record, machine)), _closed_loop(record, machine)
-    names = SignalNames([i.name for i in machine.inputs], [o.name for o in machine.outputs])
-    mistake = mistakes.found(held.machine, segments, held.own, inputs=names.inputs, outputs=names.outputs)
+    if not segments:
+        return
+    mistake = mistakes.found(
+        production.machine, segments, production.own, inputs=production.inputs, outputs=production.outputs
+    )
     if mistake:
-        drifted.quarantined[path] = quarantine(path, drifted.loop, f"{path}: {mistake.reason}")
+        findings.quarantined[path] = quarantine(path, loop, f"{path}: {mistake.reason}")
         segments, closed_loop = mistake.undone, {}
-    measured = _measure(limits, segments, held, closed_loop, names)
-    if not mistake and (doubt := _doubtful(measured, segments, held, names)):
-        if doubt.wrong:
-            drifted.quarantined[path] = quarantine(path, drifted.loop, f"{path}: {doubt.words}")
-            return drifted
-        if not measured.found:
-            drifted.notes.append(f"{path}: {doubt.words}, and no single change explains it")
-        measured = measured._replace(
-            found=[one._replace(words=f"{one.words}; or {doubt.words}") for one in measured.found]
-        )
-    drifted.figures[path] = measured.figures
-    drifted.notes.append(f"{Path(path).name} would have shown {measured.figures.least}")
-    nights.append(NightChanges({found.key: found.estimate for found in measured.found}, measured.seeming))
+    measured = _measure(segments, production, closed_loop)
+    changes = measured.changes
+    if not mistake and (doubt := _find_doubt(measured, segments, production)):
+        words, wrong = doubt
+        if wrong:
+            findings.quarantined[path] = quarantine(path, loop, f"{path}: {words}")
+            return
+        if not changes:
+            findings.notes.append(f"{path}: {words}, and no single change explains it")
+        changes = [change._replace(words=f"{change.words}; or {words}") for change in changes]
+    findings.figures[path] = measured.figures
+    findings.notes.append(f"{Path(path).name} would have shown {measured.figures['least']}")
+    nights.append({one.key: [round(one.size, 6), round(one.deviation, 6)] for one in changes})
     del nights[:-POOLED]
-    singly = [
-        (found, _past_limit([night.named.get(found.key) for night in nights], found.limit))
-        for found in measured.found
-    ]
-    pooled = [
-        (found, _past_limit([found.estimate], found.limit)) for found in together(limits, nights, held, names)
-    ]
-    told = [cause.words for cause in measured.loop]
-    alarms, watched = list(drifted.alarms), list(drifted.watched)
-    for found, sure in (*pooled, *singly):
-        if abs(found.estimate.amount) < found.limit and sure < limits.limit_sigmas:
-            continue
-        estimate = found.estimate
-        sigmas = float(np.clip(estimate.amount / max(estimate.deviation, 1e-9), -999.0, 999.0))
-        alarm = Alarm(
-            drifted.loop, f"{drifted.loop}: {found.key}", path, found.words, round(sigmas, 1), tuple(told),
-            found.kind, found.channel,
-        )  # fmt: skip
-        (alarms if sure >= limits.limit_sigmas else watched).append(alarm)
-    drifted = drifted._replace(alarms=alarms, watched=watched)
-    if alarms or watched:
-        return drifted
-    return pictures.with_alarms(drifted, limits, path, measured.loop, pending)
+    consequences, quiet = tuple(cause.words for cause in measured.loop), True
+    for change in changes:
+        sure = past_limit([night.get(change.key) for night in nights], change.limit)
+        if abs(change.size) >= change.limit or sure >= production.limits.limit_sigmas:
+            sigmas = float(np.clip(change.size / max(change.deviation, 1e-9), -999.0, 999.0))
+            alarm = Alarm(
+                loop, f"{loop}: {change.key}", path, change.words, round(sigmas, 1), consequences,
+                change.kind, change.channel,
+            )  # fmt: skip
+            (findings.alarms if sure >= production.limits.limit_sigmas else findings.watched).append(alarm)
+            quiet = False
+    if quiet:
+        pictures.add_alarms(findings, production.limits, loop, path, measured.loop, pending)
 
 
-def _past_limit(estimates: Sequence[Estimate | None], limit: float) -> float:
+def past_limit(estimates: Sequence[Sequence[float] | None], limit: float) -> float:
     """How surely a change is past its limit, in sigmas: the largest of the last nights' evidence together, of
-    the last one, the last two, and so on while they agree in sign (Page's test; Page 1954)."""
+    the last one, the last two, and so on while they agree in sign (Page's test; Page 1954). `estimates` are
+    [size, standard deviation] of each night, None if it named nothing."""
     largest, total, sign = -np.inf, 0.0, 0.0
     for k, estimate in enumerate(reversed(estimates), 1):
-        if estimate is None or sign * estimate.amount < 0:
+        if estimate is None or sign * estimate[0] < 0:
             break
-        sign = np.sign(estimate.amount)
-        total += (abs(estimate.amount) - limit) / max(estimate.deviation, 1e-9)
+        sign = np.sign(estimate[0])
+        total += (abs(estimate[0]) - limit) / max(estimate[1], 1e-9)
         largest = max(largest, total / np.sqrt(k))
     return float(largest)
-
-
-def together(
-    limits: DriftLimits, nights: Nights, held: ProductionReference, names: SignalNames
-) -> list[RecordingChange]:
-    """What the last nights name together where the last one by itself names nothing: the change whose mean
-    over two or more of them, weighted by what each knows, explains most (fixed effects; Basseville and
-    Nikiforov 1993, ch. 2.4). Empty where none is TOGETHER sigmas from none."""
-    causes = drift.causes(held.machine.plant)
-    usual, best = held.own.usual(causes), (TOGETHER**2, [])
-    for count in range(2, len(nights) + 1):
-        means = [
-            (cause, mean)
-            for cause in causes
-            if (mean := _mean_of(nights[-count:], _key(cause, names)))
-            and _worth(mean) > 2 * count * usual[cause]
-        ]
-        means.sort(key=lambda one: -_worth(one[1]))
-        if means and (most := _worth(means[0][1])) > best[0]:
-            rivals = [one for one in means if most - _worth(one[1]) < drift.RIVALS]
-            best = most, [_said(limits, cause, mean, names) for cause, mean in rivals]
-    return [_likeliest(best[1])] if best[1] else []
-
-
-def _mean_of(nights: Nights, key: str) -> Estimate | None:
-    """Mean of a change over the nights that know of it, weighted by what they know; None where the last one
-    does not, no other does, or they contradict each other (Cochran 1954): what came may have gone."""
-    known = [night.named.get(key) or night.seeming.get(key) for night in nights]
-    if nights[-1].seeming.get(key) is None or sum(one is not None for one in known) < 2:
-        return None
-    weights = np.array([1 / max(one.deviation, 1e-9) ** 2 for one in known if one])
-    amounts = np.array([one.amount for one in known if one])
-    mean = float(weights @ amounts / weights.sum())
-    if weights @ (amounts - mean) ** 2 > CONTRADICTED * (len(amounts) - 1):
-        return None
-    return Estimate(mean, float(weights.sum() ** -0.5))
-
-
-def _worth(estimate: Estimate) -> float:
-    """What a change explains: its sigmas from none, squared."""
-    return (estimate.amount / estimate.deviation) ** 2
 
 
 # ---- one recording
 
 
 class RecordingDrift(NamedTuple):
-    """Of one recording: figures for the page, what changed, what each change would be where none is named,
-    and what the closed loop does otherwise beyond what those changes and the air around bring. `misfit` is
-    the mean squared error that is left, in that of the champion's own."""
+    """Of one recording: figures for the page, what changed, and what the closed loop does otherwise beyond
+    what those changes and the air around bring. `misfit` is the mean squared error that is left, in that of
+    the champion's own."""
 
-    figures: RecordingFigures
-    found: list[RecordingChange]
-    seeming: dict[str, Estimate]
+    figures: dict[str, Any]
+    changes: list[RecordingChange]
     loop: list[CameraChange]
     misfit: float
 
 
-class Doubt(NamedTuple):
-    """That a record may not be of this machine, in words; `wrong`: it is set aside, and no cause is named."""
+def _measure(
+    segments: Segments, production: ProductionReference, closed_loop: Mapping[str, list[list[float]]]
+) -> RecordingDrift:
+    own = production.own
+    record, explained = drift.explain_segments(
+        production.machine,
+        segments,
+        own.scale,
+        own.changes,
+        own.usual(drift.causes(production.machine.plant)),
+    )
+    changes = [
+        _join_rivals([_say(production, fit, segments) for fit in (named.fit, *named.rivals)])
+        for named in explained.named
+    ]
+    air = drift.levels(record, explained.changes)[0]
+    if abs(air) > production.limits.ambient_degC:
+        changes.append(_say_air(production, air, record))
+    effect = drift.moved(record, own.changes, explained.changes) + abs(air)
+    figures, loop, not_applicable = _compare_loop(closed_loop, production, effect, unchanged=not changes)
+    innovation, louder = _compare_noise(record, explained, production)
+    fits = [*explained.others, *(named.fit for named in explained.named)]
+    samples = sum(int(one.measured.sum()) for one in record.segments)
+    return RecordingDrift(
+        {
+            "parameters": _tell_parameters(fits, production),
+            "innovation": innovation,
+            "closed_loop": figures,
+            "not_applicable": not_applicable,
+            "least": _tell_least(fits, production),
+        },
+        [*changes, *louder],
+        loop,
+        float(explained.left @ explained.left) / max(samples, 1),
+    )
 
-    words: str
-    wrong: bool
 
-
-def _doubtful(
-    measured: RecordingDrift, segments: Segments, held: ProductionReference, names: SignalNames
-) -> Doubt | None:
-    """None where the causes that were named can be, and explain the record. A heater that is dead looks like
-    commands that are written too large: a gain that fell is told with the mistake beside it."""
-    cannot_be = [one for one in measured.found if _cannot_be(one)]
-    unexplained = measured.misfit > UNEXPLAINED * mistakes.honest(held.own)
-    if not cannot_be and not unexplained and len(measured.found) < drift.MOST:
+def _find_doubt(
+    measured: RecordingDrift, segments: Segments, production: ProductionReference
+) -> tuple[str, bool] | None:
+    """Why a record may not be of this machine, in words, and whether it is set aside; None if the causes that
+    were named can be, and explain the record. A heater that is dead looks like commands that are written too
+    large: a gain that fell is told with the mistake beside it."""
+    impossible = [change for change in measured.changes if cannot_be(change.kind, change.size)]
+    unexplained = measured.misfit > UNEXPLAINED * mistakes.honest(production.own)
+    if not impossible and not unexplained and len(measured.changes) < drift.MOST:
         return None
     likeliest = mistakes.likeliest(
-        held.machine, segments, held.own, inputs=names.inputs, outputs=names.outputs
+        production.machine, segments, production.own, inputs=production.inputs, outputs=production.outputs
     )
     words = "this record does not fit the machine"
     if likeliest.better >= WORTH_NAMING:
         words += (
             f": likeliest mistake: {likeliest.words}; undone, it fits {likeliest.better:.0f} times better"
         )
-    fell = [one for one in cannot_be if one.kind.startswith("gain") and one.estimate.amount < 0]
-    return Doubt(words, likeliest.better >= LIKELY and not fell)
+    gains = [change.size for change in measured.changes if change.kind.startswith("gain")]
+    fell = any(size < FELL_PERCENT for size in gains)
+    return words, likeliest.better >= LIKELY and not fell
 
 
-def _cannot_be(found: RecordingChange) -> bool:
+def cannot_be(kind: str, size: float) -> bool:
     """Whether no machine changes so within a night."""
-    kind, amount = found.kind.split(" or ")[0], found.estimate.amount
+    kind = kind.split(" or ")[0]
     if kind == "ambient":
-        return not COLDEST_DEGC < ROOM_DEGC + amount < HOTTEST_DEGC
-    return abs(amount) > {"gain": MOST_GAIN_PERCENT, "offset": MOST_OFFSET_DEGC}.get(kind, np.inf)
+        return not COLDEST_DEGC < ROOM_DEGC + size < HOTTEST_DEGC
+    return abs(size) > {"gain": MOST_GAIN_PERCENT, "offset": MOST_OFFSET_DEGC}.get(kind, np.inf)
 
 
-def _measure(
-    limits: DriftLimits,
-    segments: Segments,
-    held: ProductionReference,
-    closed_loop: Mapping[str, list[list[float]]],
-    names: SignalNames,
-) -> RecordingDrift:
-    own, asked = held.own, drift.causes(held.machine.plant)
-    record, explained = drift.explain_segments(
-        held.machine, segments, own.scale, own.changes, own.usual(asked)
-    )
-    found = [_found(limits, named, record, held, segments, names) for named in explained.named]
-    noise, louder = _noise(limits, record, explained, held, names)
-    air = drift.levels(record, explained.changes)[0]
-    if abs(air) > limits.ambient_degC:
-        found.append(_air(limits, air, record, held))
-    effect = drift.moved(record, own.changes, explained.changes) + abs(air)
-    loop = _loop(limits, closed_loop, held, names, effect, asked=not found)
-    parameters = _parameters(record, explained, held, names)
-    least = _least(limits, explained, held, names)
-    figures = RecordingFigures(parameters, noise, loop.figures, loop.not_applicable, least)
-    seeming = _seeming(record, explained, held, names)
-    samples = sum(int(one.measured.sum()) for one in record.segments)
-    misfit = float(explained.left @ explained.left) / max(samples, 1)
-    return RecordingDrift(figures, [*found, *louder], seeming, loop.causes, misfit)
-
-
-def _seeming(
-    record: DriftRecord, explained: Explanation, held: ProductionReference, names: SignalNames
-) -> dict[str, Estimate]:
-    """What each change would be as if it alone had come about, where none is named and the air is calm: what
-    restless air does to a level is much the same every night, and no mean takes it away. A cap has no size
-    to take a mean of."""
-    if explained.named or not record.room.calm:
-        return {}
-    fits = [fit for fit in explained.others if fit.cause.kind != "saturation"]
-    return {_key(fit.cause, names): _amount(fit, held, ()) for fit in fits}
-
-
-def _name(cause: DriftCause, names: SignalNames) -> str:
-    of = names.outputs if cause.kind in ("offset", "late sensor") else names.inputs
+def _name(cause: DriftCause, production: ProductionReference) -> str:
+    of = production.outputs if cause.kind in ("offset", "late sensor") else production.inputs
     return of[cause.channel] if cause.channel >= 0 else "every input"
 
 
-def _amount(fit: CauseFit, held: ProductionReference, segments: Segments) -> Estimate:
-    """A fit in the unit of its limit: percent, s, °C, or percent of the record."""
+def _size(fit: CauseFit, production: ProductionReference, segments: Segments = ()) -> tuple[float, float]:
+    """A fit and its standard deviation in the unit of its limit: percent, s, °C, or percent of the record."""
     cause, value, deviation = fit.cause, fit.value, fit.deviation
     if cause.kind == "saturation":
         least, most = (drift.above(segments, cause.channel, value + side * deviation) for side in (1, -1))
-        return Estimate(drift.above(segments, cause.channel, value), max((most - least) / 2, 0.5))
-    at = drift.causes(held.machine.plant).index(cause)
+        return drift.above(segments, cause.channel, value), max((most - least) / 2, 0.5)
+    at = drift.causes(production.machine.plant).index(cause)
     among = drift.shift(
         np.array([value]), np.array([deviation]),
-        held.own.values[:, [at]], held.own.deviations[:, [at]],
+        production.own.values[:, [at]], production.own.deviations[:, [at]], nights=len(production.own.noise),
     )  # fmt: skip
     moved, deviation = float(among.value[0] - among.reference[0]), float(among.deviation[0])
     if cause.kind == "gain":
-        return Estimate(100 * moved, 100 * deviation)
+        return 100 * moved, 100 * deviation
     if cause.kind == "time constant":
         longer = 1 / (1 + max(moved, -0.9))
-        return Estimate(100 * (longer - 1), 100 * deviation * longer**2)
-    if cause.kind in ("delay", "late sensor"):
-        step = held.machine.plant.sample_time_s
-        return Estimate(moved * step, deviation * step)
-    return Estimate(moved, deviation)
-
-
-def _found(
-    limits: DriftLimits,
-    named: drift.NamedCause,
-    record: DriftRecord,
-    held: ProductionReference,
-    segments: Segments,
-    names: SignalNames,
-) -> RecordingChange:
-    """What is said of a named change, and of what the record cannot tell it from."""
-    told = []
-    for fit in (named.fit, *named.rivals):
-        told.append(_said(limits, fit.cause, _amount(fit, held, segments), names, fit.value))
-    return _likeliest(told)
-
-
-def _said(
-    limits: DriftLimits, cause: DriftCause, estimate: Estimate, names: SignalNames, cap: float = np.nan
-) -> RecordingChange:
-    """A change in words; `cap` in percent is the level of a saturation."""
-    name = _name(cause, names)
-    words = _words(cause, estimate.amount, name, cap)
-    return RecordingChange(_kind(cause), name, words, estimate, _limit(limits, cause))
-
-
-def _likeliest(told: Sequence[RecordingChange]) -> RecordingChange:
-    """Rivals, the likeliest first, as one: where one of them is far past its own limit and the likeliest is
-    not, it is said first."""
-    first = max(told, key=_past)
-    if _past(first) < AHEAD or _past(told[0]) >= 1:
-        first = told[0]
-    told = [first, *(one for one in told if one is not first)]
-    rest = ": this record cannot tell which" if len(told) > 1 else ""
-    kinds = dict.fromkeys(one.kind for one in told)
-    return first._replace(kind=" or ".join(kinds), words=", or ".join(one.words for one in told) + rest)
-
-
-def _past(found: RecordingChange) -> float:
-    """The change in units of its limit."""
-    return abs(found.estimate.amount) / found.limit
+        return 100 * (longer - 1), 100 * deviation * longer**2
+    step = production.machine.plant.sample_time_s if cause.kind in ("delay", "late sensor") else 1.0
+    return moved * step, deviation * step
 
 
 def _limit(limits: DriftLimits, cause: DriftCause) -> float:
     return {
         "gain": limits.parameter_percent, "time constant": limits.time_constant_percent,
-        "delay": limits.delay_s, "offset": limits.offset_degC, "saturation": limits.at_limits_points,
-    }[_kind(cause)]  # fmt: skip
+        "delay": limits.delay_s, "late sensor": limits.delay_s, "offset": limits.offset_degC,
+        "saturation": limits.at_limits_points,
+    }[cause.kind]  # fmt: skip
 
 
-def _key(cause: DriftCause, names: SignalNames) -> str:
-    return f"{_kind(cause)} of {_name(cause, names)}"
-
-
-def _kind(cause: DriftCause) -> str:
-    return "delay" if cause.kind == "late sensor" else cause.kind
-
-
-def _words(cause: DriftCause, amount: float, name: str, cap: float) -> str:
-    kind = cause.kind
-    if kind == "gain":
-        return f"the gain from {name} has changed by {amount:+.1f} %"
-    if kind == "time constant":
-        return f"the time constants of what answers to {name} have changed by {amount:+.1f} %"
-    if kind == "saturation":
-        return (
-            f"{name} no longer gives more than {cap:.0f} %: more was asked of it in {amount:.0f} % of "
-            "the record"
-        )
-    if kind == "offset":
-        return (
-            f"{name} reads {amount:+.1f} °C from what it did: its offset, or the heat lost there, has changed"
-        )
-    verb, word = ("reads" if kind == "late sensor" else "acts"), ("later" if amount > 0 else "earlier")
+def _say(production: ProductionReference, fit: CauseFit, segments: Segments) -> RecordingChange:
+    cause, name = fit.cause, _name(fit.cause, production)
+    size, deviation = _size(fit, production, segments)
+    verb, when = ("reads" if cause.kind == "late sensor" else "acts"), ("later" if size > 0 else "earlier")
     clock = ", or the clock of the outputs is off against that of the inputs" if cause.channel < 0 else ""
-    return f"{name} {verb} {abs(amount):.1f} s {word} than it did{clock}"
+    late = f"{name} {verb} {abs(size):.1f} s {when} than it did{clock}"
+    words = {
+        "gain": f"the gain from {name} has changed by {size:+.1f} %",
+        "time constant": f"the time constants of what answers to {name} have changed by {size:+.1f} %",
+        "saturation": f"{name} no longer gives more than {fit.value:.0f} %: more was asked of it in "
+        f"{size:.0f} % of the record",
+        "offset": f"{name} reads {size:+.1f} °C from what it did: its offset, or the heat lost there, has "
+        "changed",
+        "delay": late,
+        "late sensor": late,
+    }[cause.kind]
+    kind = "delay" if cause.kind == "late sensor" else cause.kind
+    return RecordingChange(kind, name, words, size, deviation, _limit(production.limits, cause))
 
 
-def _air(limits: DriftLimits, air: float, record: DriftRecord, held: ProductionReference) -> RecordingChange:
+def _join_rivals(rivals: Sequence[RecordingChange]) -> RecordingChange:
+    """Rivals, the likeliest first, as one: if one of them is far past its own limit and the likeliest is not,
+    it is said first."""
+    past = [abs(one.size) / one.limit for one in rivals]
+    at = int(np.argmax(past))
+    first = rivals[at] if past[at] >= AHEAD and past[0] < 1 else rivals[0]
+    rivals = [first, *(one for one in rivals if one is not first)]
+    rest = ": this record cannot tell which" if len(rivals) > 1 else ""
+    kinds = dict.fromkeys(one.kind for one in rivals)
+    return first._replace(kind=" or ".join(kinds), words=", or ".join(one.words for one in rivals) + rest)
+
+
+def _say_air(production: ProductionReference, air: float, record: DriftRecord) -> RecordingChange:
     word = "warmer" if air > 0 else "colder"
     words = (
         f"it is {abs(air):.0f} °C {word} around the machine than on the champion's own nights, or every "
         "sensor reads so much from what it did"
     )
-    deviation = float(np.hypot(drift.air_deviation(record), held.own.scale.ambient))
-    return RecordingChange("ambient", "", words, Estimate(air, deviation), limits.ambient_degC)
+    deviation = float(np.hypot(drift.air_deviation(record), production.own.scale.ambient))
+    return RecordingChange("ambient", "", words, air, deviation, production.limits.ambient_degC)
 
 
-def _noise(
-    limits: DriftLimits,
-    record: DriftRecord,
-    explained: Explanation,
-    held: ProductionReference,
-    names: SignalNames,
-) -> tuple[dict[str, InnovationChange], list[RecordingChange]]:
+def _compare_noise(
+    record: DriftRecord, explained: Explanation, production: ProductionReference
+) -> tuple[dict[str, dict[str, float]], list[RecordingChange]]:
     """Noise of each output, and by how many degrees of its steady level it is off what the champion's nights
     had; then the noises that have changed."""
     value, deviation = baseline.noise(drift.by_output(record, explained.left))
-    noise = drift.shift(value, deviation, held.own.noise, held.own.noise_deviation)
-    air, own = drift.levels(record, held.own.changes)
-    ratio = np.exp(0.5 * (noise.value - noise.reference))
-    figures, found = {}, []
-    for i, output in enumerate(names.outputs):
-        percent, sigmas = 100 * float(ratio[i] - 1), float(noise.sigmas[i])
-        level = air + own[i]
-        known = np.hypot(held.own.scale.ambient, held.own.scale.level[i])
-        figures[output] = InnovationChange(percent, sigmas, float(level), float(level / known))
-        word = "grown" if percent > 0 else "fallen"
-        words = f"the noise of {output} has {word} by {abs(percent):.0f} %"
-        # of a logarithm of a variance
-        estimate = Estimate(percent, 50 * float(ratio[i] * noise.deviation[i]))
-        if abs(percent) > 0.5 * limits.noise_percent and abs(sigmas) >= drift.SURE:
-            found.append(RecordingChange("noise", output, words, estimate, limits.noise_percent))
-    return figures, found
+    noise = drift.shift(value, deviation, production.own.noise, production.own.noise_deviation)
+    air, own = drift.levels(record, production.own.changes)
+    known = np.hypot(production.own.scale.ambient, production.own.scale.level)
+    ratio, limit = np.exp(0.5 * (noise.value - noise.reference)), production.limits.noise_percent
+    figures, louder = {}, []
+    for i, output in enumerate(production.outputs):
+        percent, sigmas, level = 100 * float(ratio[i] - 1), float(noise.sigmas[i]), float(air + own[i])
+        figures[output] = {
+            "noise_percent": percent, "noise_sigmas": sigmas,
+            "mean_degC": level, "mean_sigmas": level / float(known[i]),
+        }  # fmt: skip
+        if abs(percent) > 0.5 * limit and abs(sigmas) >= drift.SURE:
+            word = "grown" if percent > 0 else "fallen"
+            words = f"the noise of {output} has {word} by {abs(percent):.0f} %"
+            # of a logarithm of a variance
+            deviation_percent = 50 * float(ratio[i] * noise.deviation[i])
+            louder.append(RecordingChange("noise", output, words, percent, deviation_percent, limit))
+    return figures, louder
 
 
-def _parameters(
-    record: DriftRecord, explained: Explanation, held: ProductionReference, names: SignalNames
-) -> dict[str, ParameterChange]:
+def _tell_parameters(
+    fits: Sequence[CauseFit], production: ProductionReference
+) -> dict[str, dict[str, float]]:
     """{cause: change in percent, half of its 90 % band, sigmas} of gains and time constants: what was named,
     and what the others seem beside it."""
-    fits = {fit.cause: fit for fit in (*explained.others, *(named.fit for named in explained.named))}
-    changes = {}
-    for cause in drift.causes(held.machine.plant):
+    fit_of, figures = {fit.cause: fit for fit in fits}, {}
+    for cause in drift.causes(production.machine.plant):
         if cause.kind in ("gain", "time constant"):
-            percent, deviation = _amount(fits[cause], held, ())
-            changes[f"{cause.kind} from {_name(cause, names).replace('every input', 'all inputs')}"] = (
-                ParameterChange(percent, 1.645 * deviation, percent / max(deviation, 1e-9))
-            )
-    return changes
+            percent, deviation = _size(fit_of[cause], production)
+            name = f"{cause.kind} from {_name(cause, production).replace('every input', 'all inputs')}"
+            sigmas = percent / max(deviation, 1e-9)
+            figures[name] = {"percent": percent, "band_percent": 1.645 * deviation, "sigmas": sigmas}
+    return figures
+
+
+def _tell_least(fits: Sequence[CauseFit], production: ProductionReference) -> str:
+    """The smallest changes of a gain and of an offset that would have been an alarm tonight, of the signal
+    that is known least."""
+    words = []
+    for article, kind, unit in (("a", "gain", "%"), ("an", "offset", "°C")):
+        sizes = {
+            _name(fit.cause, production): _limit(production.limits, fit.cause)
+            + production.limits.limit_sigmas * _size(fit, production)[1]
+            for fit in fits
+            if fit.cause.kind == kind and fit.cause.channel >= 0
+        }
+        worst = max(sizes, key=sizes.__getitem__)
+        words.append(f"{article} {kind} of {worst} from {sizes[worst]:.1f} {unit} on")
+    return " and ".join(words)
 
 
 # ---- the closed loop
@@ -736,73 +591,56 @@ def _mean(values: np.ndarray) -> list[list[float]]:
     ]
 
 
-class LoopChanges(NamedTuple):
-    """Of the closed loop: figures by name, what has changed, and why it was not asked, if it was not."""
-
-    figures: dict[str, ClosedLoopChange]
-    causes: list[CameraChange]
-    not_applicable: str = ""
-
-
-def _loop(
-    limits: DriftLimits,
+def _compare_loop(
     now: Mapping[str, list[list[float]]],
-    held: ProductionReference,
-    names: SignalNames,
+    production: ProductionReference,
     effect: np.ndarray,
     *,
-    asked: bool,
-) -> LoopChanges:
-    """Offset, effort and share at limits against the champion's own nights; not asked where those were not
-    settled at the references. `effect` (p,) are the °C that the changes of the machine and the air around
-    bring: what they explain is not counted again; `asked` is whether the machine is as it was."""
-    nights = [night for night in held.loop if night]
+    unchanged: bool,
+) -> tuple[dict[str, dict[str, float]], list[CameraChange], str]:
+    """Offset, effort and share at limits against the champion's own nights: figures by name, what has
+    changed, and why it was not asked, if it was not. `effect` (p,) are the °C that the changes of the machine
+    and the air around bring: what they explain is not counted again; `unchanged`: the machine is as it
+    was."""
+    limits, nights = production.limits, [night for night in production.loop if night]
     if not now or not nights:
-        return LoopChanges({}, [], "no stretch is settled at a set-point")
+        return {}, [], "no stretch is settled at a set-point"
     usual = {key: np.array([night[key] for night in nights]) for key in now}
     offset = usual["offset_degC"][:, 0].mean(axis=0)
     unsure = np.sqrt((usual["offset_degC"][:, 1] ** 2).mean(axis=0) / len(nights))
     if (np.abs(offset) > SETTLED * limits.offset_degC + 2 * unsure).any():
-        return LoopChanges(
-            {}, [], "the champion's own recordings are not of a loop settled at the references"
-        )
-    figures, causes = {}, []
+        return {}, [], "the champion's own recordings are not of a loop settled at the references"
     aims = usual["set_point_degC"][:, 0]
     elsewhere = np.abs(now["set_point_degC"][0] - aims).min(axis=0).max() > limits.offset_degC
-    for key, (sentence, least, allowed) in _asked(limits, held, names, effect).items():
-        if elsewhere and key != "offset_degC":  # other set-points take other duties
-            continue
-        of = names.outputs if key == "offset_degC" else names.inputs
-        moved = _loop_shift(now[key], usual[key], least)
-        for k, (name, by) in enumerate(zip(of, moved.value - moved.reference, strict=True)):
-            figures[f"{name} {key}"] = ClosedLoopChange(float(by), float(moved.sigmas[k]))
-            beyond = abs(by) - least - (allowed[k] if asked else 0.0)
-            if beyond > 0:
-                words = f"closed loop: {name} {sentence.format(f'{by:+.2g}')}"
-                sigmas = float(moved.sigmas[k]) * beyond / abs(by) if asked else float(moved.sigmas[k])
-                causes.append(CameraChange(f"{key} of {name}", words, sigmas))
-    return LoopChanges(figures, causes)
-
-
-def _asked(
-    limits: DriftLimits, held: ProductionReference, names: SignalNames, effect: np.ndarray
-) -> dict[str, tuple[str, float, np.ndarray]]:
-    """By figure of the closed loop: its sentence, what matters, and what the machine's changes may bring."""
-    plant = held.machine.plant
+    plant = production.machine.plant
     steady = np.abs(plant.C @ np.linalg.solve(np.eye(plant.n) - plant.A, plant.B) + plant.D)
     strongest = steady.argmax(axis=0)
     points = effect[strongest] / np.maximum(steady[strongest, np.arange(plant.m)], 1e-9)
-    none = np.zeros(plant.m)
-    return {
+    # by figure its sentence, what matters, and what the machine's changes may bring
+    asked = {
         "offset_degC": ("settles {} °C from where it did", limits.offset_degC, effect),
         "effort_percent": ("needs {} points of effort more than it did", limits.effort_percent, points),
         "at_limits_percent": (
-            "is at a limit {} points more of the time than it was", limits.at_limits_points, none,
+            "is at a limit {} points more of the time than it was", limits.at_limits_points, 0 * points,
         ),
     }  # fmt: skip
+    figures, causes = {}, []
+    for key, (sentence, least, allowed) in asked.items():
+        if elsewhere and key != "offset_degC":  # other set-points take other duties
+            continue
+        moved = _shift_loop(now[key], usual[key], least)
+        for k, name in enumerate(production.outputs if key == "offset_degC" else production.inputs):
+            by, sigmas = float(moved.value[k] - moved.reference[k]), float(moved.sigmas[k])
+            figures[f"{name} {key}"] = {"moved": by, "sigmas": sigmas}
+            beyond = abs(by) - least - (allowed[k] if unchanged else 0.0)
+            if beyond > 0:
+                words = f"closed loop: {name} {sentence.format(f'{by:+.2g}')}"
+                sigmas *= beyond / abs(by) if unchanged else 1.0
+                causes.append(CameraChange(f"{key} of {name}", words, sigmas))
+    return figures, causes, ""
 
 
-def _loop_shift(now: list[list[float]], usual: np.ndarray, least: float) -> drift.Shift:
+def _shift_loop(now: list[list[float]], usual: np.ndarray, least: float) -> drift.Shift:
     """Of one figure against those of the champion's nights (nights, 2, signals)."""
     # a figure counts as known to a sixth of what matters at best, so that
     # nights that agree by chance make no alarm of a trifle

@@ -18,18 +18,18 @@ STORED = "datasets/verdict"
 REPORT = "datasets/report/figures.json"
 
 
-def read_verdicts(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], Night]:
-    """The verdict of each loop that has a page, as pages say it; the night with a note if they are of other
-    files. A loop that is judged by a file of costs has none: its rules are the guards of that file. If
-    nightly.holdout.controller names a controller, the temperature loop's verdict is about that one."""
+def read_verdicts(settings: Nightly, night: Night) -> dict[str, Verdict]:
+    """The verdict of each loop that has a page, as pages say it. A loop that is judged by a file of costs has
+    none: its rules are the guards of that file. If nightly.holdout.controller names a controller, the
+    temperature loop's verdict is about that one."""
     loops = [name for name, loop in settings.loops.items() if loop.judge != "cases"]
     if not loops:
-        return {}, night
+        return {}
     evidence = read_evidence(STORED)
     stored, named = verdict.read(STORED), settings.holdout.controller
     tonight = artifacts.read_json(METRICS) if artifacts.exists(METRICS) else None
     by_loop = verdict_night.verdicts(evidence, stored, tonight)
-    night = _make_pages_agree(by_loop, night)
+    _make_pages_agree(by_loop, night)
     if named != judge.PAGE:
         by_loop = verdict_night.verdicts(evidence, stored, tonight, named=named)
     if lacking := [name for name in loops if name not in by_loop]:
@@ -37,19 +37,16 @@ def read_verdicts(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], 
             f"{STORED}/{lacking[0]}.json: expected the verdict of this run, found none; "
             "run ./run dvc repro verdict, or switch the loop off in section loops"
         )
-    return {name: by_loop[name] for name in loops}, night
+    return {name: by_loop[name] for name in loops}
 
 
-def _make_pages_agree(pages: Mapping[str, Verdict], night: Night) -> Night:
+def _make_pages_agree(pages: Mapping[str, Verdict], night: Night) -> None:
     """Makes the pages anew if they were made before drift or production changed, so that they say what the
     night goes by."""
-    if not artifacts.exists(REPORT):
-        return night
-    shown = artifacts.read_json(REPORT).get("verdicts") or {}
-    if all(shown.get(loop) == verdict.metrics() for loop, verdict in pages.items()):
-        return night
+    shown = (artifacts.read_json(REPORT).get("verdicts") or {}) if artifacts.exists(REPORT) else None
+    if shown is None or all(shown.get(loop) == verdict.metrics() for loop, verdict in pages.items()):
+        return
     try:
         dvc("repro", "--single-item", "--force", "report")
     except ValueError as error:
-        return night.noted(f"the pages are not of tonight ({error}); run ./run dvc repro --force report")
-    return night
+        night.notes.append(f"the pages are not of tonight ({error}); run ./run dvc repro --force report")

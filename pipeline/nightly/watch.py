@@ -82,17 +82,12 @@ def stamp(now: datetime.datetime) -> str:
     return now.astimezone(datetime.UTC).isoformat(timespec="seconds")
 
 
-def hours_since(when: str, now: datetime.datetime) -> float:
-    """Hours from a time as `stamp` writes it; below 0 where that lies in the future."""
-    return (now - datetime.datetime.fromisoformat(when)).total_seconds() / 3600
-
-
 def find_overdue(now: datetime.datetime, success: str, watch_h: float) -> str:
     """Why somebody should look: the last success is older than `watch_h` hours,
     or lies in the future; empty where all is well."""
     if not success:
         return "no night has ever succeeded; run ./run beadline nightly, and look at its schedule"
-    age_h = hours_since(success, now)
+    age_h = (now - datetime.datetime.fromisoformat(success)).total_seconds() / 3600
     if age_h < -0.1:
         return (
             f"the clock is wrong: the last success, {success}, is {-age_h:.1f} h from now in the future; "

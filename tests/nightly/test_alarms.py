@@ -15,7 +15,7 @@ from pipeline.cli import render_night
 from pipeline.nightly import night, promoting, remembered, reporting, reproducing, watch, worktree
 from pipeline.nightly.records import Night
 from pipeline.nightly.settings import Nightly
-from tests.nightly.toy_nights import SETTINGS, Project, entered
+from tests.nightly.toy_nights import SETTINGS, Project
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +26,6 @@ def first(tmp_path_factory):
     (project.folder / ".gitignore").write_text("/reports/*.html\n/woken.json\n")
     project.run("git", "commit", "-qam", "an alarm")
     return project.promoted()
-
-
-@pytest.fixture
-def project(first, tmp_path, monkeypatch):
-    return entered(first, tmp_path / "toy", monkeypatch)
 
 
 @pytest.fixture
@@ -107,7 +102,7 @@ def test_stages_that_take_too_long_and_a_disk_without_room_are_told(project):
 @pytest.mark.parametrize(
     ("place", "name"),
     [(worktree, "take"), (reproducing, "reproduce"), (promoting, "judge_all"), (night.landing, "commit"),
-     (remembered, "remember")],
+     (remembered, "write")],
 )  # fmt: skip
 def test_a_mistake_of_this_program_is_told_in_a_sentence_with_its_traceback_in_the_log(
     project, monkeypatch, place, name
@@ -123,7 +118,7 @@ def test_a_mistake_of_this_program_is_told_in_a_sentence_with_its_traceback_in_t
     assert "unforeseen" in Path(".beadline/logs/night-0002.log").read_text()
     assert "unforeseen" in Path("woken.json").read_text()
     # a night that could not be remembered has promoted all the same
-    promoted = name == "remember"
+    promoted = name == "write"
     assert project.champion()["run"] == ("night-0002" if promoted else "night-0001")
 
 
@@ -249,7 +244,8 @@ def test_a_file_name_is_no_tag_mention_picture_or_emphasis_in_a_chat(tmp_path, m
 
 def test_used_shares_are_said_in_the_summary():
     used = {"datasets/raw/t/shift_12.mcap": (61.4, 2.0, 38.0), "b.csv": (100.0, 0.0, 0.0)}
-    shares = {path: reporting.records.RecordShare(*share) for path, share in used.items()}
+    keys = ("used_percent", "masked_percent", "cut_percent")
+    shares = {path: dict(zip(keys, share, strict=True)) for path, share in used.items()}
     summary = reporting.summarise(Night(1, "night-0001", "", "kept", used=shares), [])
     assert "used 61 % of shift_12.mcap, masked, cut" in summary and "used 100 % of b.csv |" in summary
 

@@ -10,7 +10,7 @@ from pipeline.nightly import camera_drift
 LIMITS = {"moved_px": 2.0, "contrast_percent": 15.0}
 
 
-def night(seed: int, **changes) -> camera_drift.FrameStats:
+def night(seed: int, **changes) -> camera_drift.Stats:
     """25 frames of a bead between 100 and 116 px wide, as the ink lies that night."""
     rng = np.random.default_rng(seed)
     camera = rendering.SimulatedCamera(rendering.NOMINAL._replace(**changes), rng)
@@ -20,7 +20,7 @@ def night(seed: int, **changes) -> camera_drift.FrameStats:
 
 
 @pytest.fixture(scope="module")
-def good() -> list[camera_drift.FrameStats]:
+def good() -> list[camera_drift.Stats]:
     return [night(k) for k in range(4)]
 
 
@@ -54,7 +54,7 @@ def test_a_change_is_named_and_found_in_two_nights(good, changes, key):
 
 def test_the_line_s_place_is_read_to_a_tenth_of_a_pixel(good):
     moved = night(60, offset_px=rendering.NOMINAL.offset_px + 4)
-    assert moved.mean[0] - np.mean([stats.mean[0] for stats in good]) == pytest.approx(
+    assert moved[0][0] - np.mean([median[0] for median, _ in good]) == pytest.approx(
         4, abs=0.3
     )  # the bead's own wander is 0.2 px
 
@@ -76,7 +76,7 @@ def test_the_balance_of_classes_moves_when_it_moves():
     np.testing.assert_allclose(balance.value - balance.reference, [100 / 3, -100 / 3, 0], atol=1e-9)
 
 
-def prints(seed: int, shares: list[float], level: float) -> tuple[np.ndarray, camera_drift.Contrast]:
+def prints(seed: int, shares: list[float], level: float) -> tuple[np.ndarray, camera_drift.Stats]:
     """Of a print of 600 frames in 30 segments of 20 that are alike:
     frames by kind, and the line's contrast."""
     rng = np.random.default_rng(seed)

@@ -178,6 +178,19 @@ def test_a_baseline_takes_up_what_its_own_records_hold_to_be_otherwise(machine):
     assert fit.cause == drift.DriftCause("gain", 0) and fit.value == pytest.approx(1 / 0.9 - 1, abs=0.01)
 
 
+def test_what_the_champions_own_model_gets_wrong_of_its_nights_is_no_change_of_a_later_one(machine):
+    """The models that are identified without a night may get it right where the champion's own does not."""
+    honest = two_zones(gain=(0.985, 1.0))
+    right = drift.ProductionModel(honest._replace(K=robust_observer_gain(honest, 1.0)), SAMPLES)
+    nights = [[record(honest, 940 + k)] for k in range(4)]
+    floors = baseline.Floors(0.03, 0.25)
+    blind = baseline.measured(machine, nights, floors, [right] * 4)
+    gain = CAUSES.index(drift.DriftCause("gain", 0))
+    np.testing.assert_allclose(blind.values[:, gain], [0.0] * 4 + [-0.015] * 4, atol=0.006)
+    for seed in (50, 51):
+        assert explained(machine, blind, record(honest, seed))[1].named == []
+
+
 def test_a_baseline_comes_back_from_its_file(own):
     again = Baseline.read(own.to_json())
     for name in ("scale", "changes"):
@@ -272,6 +285,13 @@ def test_a_mistake_in_a_record_is_named_and_undone(machine, own, spoil, words):
 def test_a_drifted_machine_is_no_mistake_of_the_record(machine, own, truth, spoilt):
     for seed in (6, 7):
         assert mistakes.found(machine, [record(truth, seed, **spoilt)], own, **SIGNALS) is None
+
+
+def test_sensors_that_are_scaled_down_explain_no_more_for_erring_less(machine, own):
+    u, y = record(two_zones(), 5)
+    likeliest = mistakes.likeliest(machine, [(u / 10, y)], own, **SIGNALS)
+    assert likeliest.words == "every input is written 10 times too small"
+    assert likeliest.left < mistakes.honest(own)
 
 
 def test_a_record_that_is_wrong_in_two_ways_is_not_put_down_to_one(machine, own):

@@ -14,7 +14,7 @@ from pipeline.cli import render_night
 from pipeline.deposition.tables import SCORES
 from pipeline.nightly import champion, judge, night, promoting, reporting, reproducing, screening, verdicts
 from pipeline.nightly.decision import CaseCosts
-from pipeline.nightly.records import CANDIDATE, FIRST, KEPT, PROMOTED, Champion, ChampionState, Lineage, Night
+from pipeline.nightly.records import CANDIDATE, FIRST, KEPT, PROMOTED, Champion, ChampionState, Night
 from pipeline.nightly.settings import Nightly
 from pipeline.report.index import page as index_page
 from pipeline.report.nightly import page as nightly_page
@@ -38,8 +38,12 @@ LOOPS = {
     "setpoint": ["datasets/train_classifier/windows.parquet"],
 }
 ABSENT = "absent"  # nothing was judged, and so everything is open
-TONIGHT = Night(7, "night-0007", "2030-01-09T02:00:00+00:00", seconds=1.0)
+WHEN = "2030-01-09T02:00:00+00:00"
 NIGHTLY = "reports/metrics/nightly.json"
+
+
+def make_tonight() -> Night:
+    return Night(7, "night-0007", WHEN, seconds=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +94,7 @@ def settings(**holdout) -> Nightly:
 
 def other(run="night-0003") -> Champion:
     """A champion or a candidate with other files."""
-    return Champion(run, TONIGHT.when, "", {"md5": "1"}, {"weights.json": "1"})
+    return Champion(run, WHEN, "", {"md5": "1"}, {"weights.json": "1"})
 
 
 # ---- metrics files: each rule passed, exactly at its limit, undecided, failed, open
@@ -286,7 +290,8 @@ def test_page_and_night_never_disagree(project, seed):
         {loop: other() for loop in LOOPS if rng.random() < 0.5},
         candidates={loop: other("night-0005") for loop in LOOPS if rng.random() < 0.5},
     )
-    tonight, after = promoting.judge_all(asked, TONIGHT, before, lineage=Lineage)
+    tonight = make_tonight()
+    after = promoting.judge_all(asked, tonight, before, {})
     sources = page_sources()
     index = words(index_page.render(sources, judgement(sources)))
     page = nightly_page.render([tonight], after, asked)
@@ -357,7 +362,8 @@ def test_a_champion_of_the_heaters_has_a_passed_certificate_of_its_own(
         Path(name).write_text("whole")
     Path("dvc.yaml").write_text(CERTIFYING)
     asked = settings()
-    tonight, after = promoting.judge_all(asked, TONIGHT, ChampionState(), lineage=Lineage)
+    tonight = make_tonight()
+    after = promoting.judge_all(asked, tonight, ChampionState(), {})
     Path("dvc.yaml").unlink()
     decision = tonight.decisions["temperature"]
     assert decision.verdict.state == PASSED and decision.promotes == (not why)
@@ -378,28 +384,29 @@ def page_sources() -> Sources:
 @pytest.mark.parametrize("key", ["", "watched", "alarms"])
 def test_the_night_goes_by_the_verdicts_that_the_pages_show(project, key):
     drift(key)(None)
-    by_loop, _ = verdicts.read_verdicts(settings(), TONIGHT)
+    by_loop = verdicts.read_verdicts(settings(), make_tonight())
     assert by_loop == page_sources().verdicts and by_loop.keys() == LOOPS.keys()
 
 
 def test_a_loop_whose_verdict_is_missing_is_never_promoted(project):
     Path("datasets/verdict/deposition.json").unlink()
     with pytest.raises(ValueError, match=r"^datasets/verdict/deposition\.json: expected the verdict"):
-        verdicts.read_verdicts(settings(), TONIGHT)
+        verdicts.read_verdicts(settings(), make_tonight())
 
 
 def test_the_report_keeps_the_verdict_of_each_loop_as_the_night_reads_it(project, monkeypatch):
     made.main()
     made_anew = []
     monkeypatch.setattr(verdicts, "dvc", lambda *command, **_: made_anew.append(command))
-    by_loop, tonight = verdicts.read_verdicts(settings(), TONIGHT)
+    tonight = make_tonight()
+    by_loop = verdicts.read_verdicts(settings(), tonight)
     kept = artifacts.read_figures("report")
     assert kept["verdicts"] == {loop: verdict.metrics() for loop, verdict in by_loop.items()}
     assert kept["verdict"] == by_loop["temperature"].metrics()
-    assert made_anew == [] and tonight == TONIGHT
+    assert made_anew == [] and tonight == make_tonight()
     # the drift that they were made with is over since: they are made anew, so that both say the same
     drift("alarms")(None)
-    verdicts.read_verdicts(settings(), TONIGHT)
+    verdicts.read_verdicts(settings(), make_tonight())
     assert made_anew == [("repro", "--single-item", "--force", "report")]
 
 
@@ -411,47 +418,48 @@ def test_pages_that_cannot_be_made_anew_are_told_and_the_night_goes_on(project, 
         raise ValueError("dvc repro failed: no room")
 
     monkeypatch.setattr(verdicts, "dvc", refused)
-    by_loop, tonight = verdicts.read_verdicts(settings(), TONIGHT)
+    tonight = make_tonight()
+    by_loop = verdicts.read_verdicts(settings(), tonight)
     assert by_loop["temperature"].state == FAILED
-    assert tonight.notes == (
-        "the pages are not of tonight (dvc repro failed: no room); run ./run dvc repro --force report",
-    )
+    assert tonight.notes == [
+        "the pages are not of tonight (dvc repro failed: no room); run ./run dvc repro --force report"
+    ]
 
 
 def test_a_contestant_that_is_named_to_run_must_pass_itself(project):
     stages = made.metrics()
     own = stages["evaluate_temperature"]["contestants"]["varx_riccati"]
-    assert verdicts.read_verdicts(settings(controller="varx_riccati"), TONIGHT)[0]["temperature"].winner == (
-        "varx_riccati"
-    )
+    assert verdicts.read_verdicts(settings(controller="varx_riccati"), make_tonight())[
+        "temperature"
+    ].winner == ("varx_riccati")
     own["overshoot"] = made.figure(9.0, 8.0, 10.0)
     artifacts.write_metrics("evaluate_temperature", stages["evaluate_temperature"])
     stage_verdict.main()
     by_page, named = (
-        verdicts.read_verdicts(settings(controller=name), TONIGHT)[0]["temperature"]
+        verdicts.read_verdicts(settings(controller=name), make_tonight())["temperature"]
         for name in ("page", "varx_riccati")
     )
     assert (by_page.state, by_page.winner) == (PASSED, "subspace_lqg")
     assert named.state == FAILED and named.subject == "varx_riccati" and named.winner is None
     assert named.sentence == "Fail (simulation). First failed rule: overshoot."
     assert "VARX + Riccati is named to run, and does not pass." in named.reason
-    tonight, after = promoting.judge_all(
-        settings(controller="varx_riccati"), TONIGHT, ChampionState(), lineage=Lineage
-    )
+    tonight = make_tonight()
+    after = promoting.judge_all(settings(controller="varx_riccati"), tonight, ChampionState(), {})
     assert tonight.decisions["temperature"].decision == CANDIDATE
     assert after.candidates["temperature"].contestant == "varx_riccati"
     # one that was not judged at all is open
-    lost = verdicts.read_verdicts(settings(controller="printer_pid"), TONIGHT)[0]["temperature"]
+    lost = verdicts.read_verdicts(settings(controller="printer_pid"), make_tonight())["temperature"]
     assert lost.state == OPEN and lost.subject == "printer_pid" and "was not judged" in lost.reason
 
 
 def test_what_runs_stays_where_the_page_finds_nobody_better_beyond_the_bands(project):
     """The page's incumbent is the champion's contestant, where there is one."""
-    assert verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"].winner == "subspace_lqg"
+    assert verdicts.read_verdicts(settings(), make_tonight())["temperature"].winner == "subspace_lqg"
     present = other()._replace(contestant="varx_riccati")
     state = ChampionState({"temperature": present})
-    artifacts.write_json(NIGHTLY, TONIGHT.metrics(state))
-    tonight, after = promoting.judge_all(settings(), TONIGHT, state, lineage=Lineage)
+    artifacts.write_json(NIGHTLY, make_tonight().metrics(state))
+    tonight = make_tonight()
+    after = promoting.judge_all(settings(), tonight, state, {})
     assert tonight.decisions["temperature"].verdict.winner == "varx_riccati"
     assert after.champions["temperature"].contestant == "varx_riccati"
 
@@ -464,10 +472,10 @@ def test_the_champion_and_the_challenger_are_each_judged_as_their_own_contestant
         return CaseCosts("panel", {f"case {k}": (f"plant {k}", 1.0) for k in range(8)}, {"worst_case": 1.0})
 
     monkeypatch.setattr(judge, "judge", lambda *_: judge.Judge(measure, lambda _: {}))
-    verdict = verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"]
+    verdict = verdicts.read_verdicts(settings(), make_tonight())["temperature"]
     for present in (other()._replace(contestant="pi_simc"), other()):
         state = ChampionState({"temperature": present})
-        promoting.judge_loop(settings(), "temperature", TONIGHT, state, verdict)
+        promoting.judge_loop(settings(), "temperature", make_tonight(), state, verdict)
     # one that was promoted before champion.json said so is what the night judged then
     assert asked == [
         ("datasets", "subspace_lqg"),
@@ -478,13 +486,13 @@ def test_the_champion_and_the_challenger_are_each_judged_as_their_own_contestant
 
 
 def test_the_same_files_as_another_contestant_are_another_challenger(project):
-    verdict = verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"]
+    verdict = verdicts.read_verdicts(settings(), make_tonight())["temperature"]
     files = md5s(LOOPS["temperature"])
     decisions = {
         contestant: promoting.judge_loop(
             settings(),
             "temperature",
-            TONIGHT,
+            make_tonight(),
             ChampionState({"temperature": other()._replace(files=files, contestant=contestant)}),
             said,
         )[0]
@@ -506,8 +514,8 @@ def test_the_same_files_as_another_contestant_are_another_challenger(project):
 
 
 def test_a_champion_that_would_lack_what_it_is_designed_from_is_not_promoted(project):
-    verdict = verdicts.read_verdicts(settings(), TONIGHT)[0]["temperature"]._replace(subject="pi_simc")
-    decided, _ = promoting.judge_loop(settings(), "temperature", TONIGHT, ChampionState(), verdict)
+    verdict = verdicts.read_verdicts(settings(), make_tonight())["temperature"]._replace(subject="pi_simc")
+    decided, _ = promoting.judge_loop(settings(), "temperature", make_tonight(), ChampionState(), verdict)
     assert decided.decision == KEPT and decided.reasons == [
         "pi_simc is designed from datasets/identify_plant/spread.parquet, which the champion would lack; add "
         "it to nightly.loops.temperature.artifacts"
@@ -561,9 +569,7 @@ def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(play
         monkeypatch.setattr(reproducing, "reproduce", reproduce)
         verdict = Verdict("deposition", state, *words_of[state], "", "", "", "basis", subject="basis")
         verdict = verdict._replace(rehearsal=True)
-        monkeypatch.setattr(
-            verdicts, "read_verdicts", lambda settings, night: ({"deposition": verdict}, night)
-        )
+        monkeypatch.setattr(verdicts, "read_verdicts", lambda settings, night: {"deposition": verdict})
         Path("learn.py").write_text(f"# night {number}\n")
         status, summary = night.nightly(render_night)
         assert status == reporting.OK, summary

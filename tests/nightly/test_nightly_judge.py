@@ -58,30 +58,38 @@ def project(tmp_path, root, monkeypatch):
     return params.load(Nightly, "nightly")
 
 
+def change(settings: Nightly, section: str, **changes) -> Nightly:
+    return settings.model_copy(update={section: getattr(settings, section).model_copy(update=changes)})
+
+
+def measure(settings: Nightly, folder: str = "datasets", kind: str = "temperature") -> CaseCosts:
+    """What the judge measures of the controller below `folder`."""
+    loop = NightlyLoop(artifacts=["x"], judge=kind, cases="", recordings="")
+    loop = settings.loops["temperature"] if kind == "temperature" else loop
+    return judge.judge(loop, settings).measure(Path(folder))
+
+
+def decided(champion: CaseCosts | None, challenger: CaseCosts, settings: Nightly, **allowed: float):
+    return decide(champion, challenger, settings.rule, allowed=allowed, alarms=[], seed=1)
+
+
 def test_both_are_judged_on_the_same_cases_and_the_same_noise_every_time(project):
-    judged = judge.judge(project.loops["temperature"], project)
-    challenger, champion, again = (
-        judged.measure(Path(folder)) for folder in ("datasets", "champion/temperature", "datasets")
+    challenger, champion, again = map(
+        measure, [project] * 3, ["datasets", "champion/temperature", "datasets"]
     )
-    assert (
-        challenger == again
-        and challenger.panel == champion.panel
-        and list(challenger.cases) == list(champion.cases)
-    )
+    assert challenger == again and challenger.panel == champion.panel
+    assert list(challenger.cases) == list(champion.cases)
     assert len({block for block, _ in challenger.cases.values()}) == project.holdout.plants
     # the one that creeps costs more in every block, and the rule says so both ways round
-    rule = {"allowed": dict.fromkeys(champion.guards, 1e9), "alarms": [], "seed": 1}
-    assert decide(champion, challenger, project.rule, **rule).decision == PROMOTED
-    assert decide(challenger, champion, project.rule, **rule).decision == KEPT
-
-
-def test_another_panel_has_another_name(project):
-    other = project.model_copy(update={"holdout": project.holdout.model_copy(update={"seed": 902})})
-    first, second = (
-        judge.judge(settings.loops["temperature"], settings).measure(Path("datasets"))
-        for settings in (project, other)
-    )
-    assert first.panel != second.panel
+    allowed = dict.fromkeys(champion.guards, 1e9)
+    assert decided(champion, challenger, project, **allowed).decision == PROMOTED
+    assert decided(challenger, champion, project, **allowed).decision == KEPT
+    # another panel has another name
+    assert measure(change(project, "holdout", seed=902)).panel != challenger.panel
+    # weights that hold another version's too are read as today's
+    path = "datasets/tune_weights/weights.json"
+    artifacts.write_json(path, artifacts.read_json(path) | {"practical": {"subspace_lqg": 3.0}})
+    assert measure(project) == challenger
 
 
 V01 = {"practical": {"q": [1.0] * 5, "r": [1.0] * 7, "observer_tau": 1.0}}
@@ -98,19 +106,19 @@ SUBSPACE = {"contestants": {"subspace_lqg": {"effort_weight": 1.0, "observer_tau
     ],
 )
 def test_a_champion_that_cannot_be_designed_is_named_and_stays(project, name, weights, sentence):
-    settings = project.model_copy(update={"holdout": project.holdout.model_copy(update={"controller": name})})
+    settings = change(project, "holdout", controller=name)
     settings.loops["temperature"].artifacts.extend(promoting.OPTIONAL)
     for folder in ("datasets", "champion/temperature"):
         artifacts.write_arrays(f"{folder}/identify_plant/spread.parquet", "spread", 1, plant.stored([baam()]))
         artifacts.write_json(f"{folder}/tune_weights/weights.json", weights)
     with pytest.raises(judge.NotComparable, match=sentence) as refused:
-        judge.judge(settings.loops["temperature"], settings).measure(Path("champion/temperature"))
+        measure(settings, "champion/temperature")
     assert "\n" not in str(refused.value)
     present = Champion("night-0001", "", "", {"md5": "0"})
     state = ChampionState({"temperature": present})
     quiet = Night(2, "night-0002", "2030-01-01T02:00:00+00:00")
-    decided, _ = promoting.judge_loop(settings, "temperature", quiet, state, None)
-    assert decided.decision == KEPT and "cannot be compared: " in decided.reasons[0]
+    decision, _ = promoting.judge_loop(settings, "temperature", quiet, state, None)
+    assert decision.decision == KEPT and "cannot be compared: " in decision.reasons[0]
 
 
 def test_the_contestants_that_the_night_may_judge_are_all_but_doing_nothing_and_the_yardstick():
@@ -138,46 +146,46 @@ def test_a_recorded_machines_panel_is_drawn_around_its_hold_out_recordings_once_
 
 def test_the_margin_that_guards_is_that_of_the_weakest_tenth_of_plants_as_the_page_asks(project):
     margins = judge.judged(judge.frozen_panel(project.holdout), Path("datasets"), "varx_riccati").margins
-    strict = project.model_copy(update={"rule": project.rule.model_copy(update={"least_disk_margin": 1.9})})
-    guards = judge.judge(strict.loops["temperature"], strict).measure(Path("datasets")).guards
+    guards = measure(change(project, "rule", least_disk_margin=1.9)).guards
     disks = sorted(margin.disk for margin in margins)
     assert guards["margin_short_of_least"] == 1.9 - disks[round(0.1 * (len(disks) - 1))]
     assert len({margin.disk for margin in margins}) == project.holdout.plants
 
 
 def test_a_controller_that_destabilises_a_plant_says_so(project):
-    learned = window.restored(artifacts.read_arrays("datasets/learn_kernel/window.parquet", "window", 1))
+    path = "datasets/learn_kernel/window.parquet"
+    learned = window.restored(artifacts.read_arrays(path, "window", 1))
     Theta = learned.Theta.copy()
     Theta[:, : 7 * learned.N] *= -1  # every heater taken for a cooler
-    artifacts.write_arrays(
-        "datasets/learn_kernel/window.parquet", "window", 1, window.stored(learned._replace(Theta=Theta))
-    )
-    assert (
-        judge.judge(project.loops["temperature"], project).measure(Path("datasets")).guards["unstable_plants"]
-        > 0
-    )
+    artifacts.write_arrays(path, "window", 1, window.stored(learned._replace(Theta=Theta)))
+    assert measure(project).guards["unstable_plants"] > 0
+
+
+def score(errors: list[float], lines: list[float]) -> None:
+    """What compose_parts scored: of each part the chosen composer, and on-off control beside it."""
+    parts = [chr(97 + k) for k in range(len(errors))]
+    columns = {
+        "part": parts + parts, "material": ["A"] * 2 * len(parts),
+        "composer": ["basis"] * len(parts) + ["on_off"] * len(parts),
+        "chosen": [True] * len(parts) + [False] * len(parts),
+        "rms_percent_of_on_off": errors + [100.0] * len(parts),
+        "predicted_percent": [np.nan] * 2 * len(parts),
+        "worst_line_volume_percent": lines + [90.0] * len(parts),
+    }  # fmt: skip
+    artifacts.write_table("datasets/compose_parts/scores.parquet", SCORES, columns)
 
 
 def test_a_part_s_chosen_composer_is_its_case(project):
-    columns = {
-        "part": ["a", "a", "b"], "material": ["A", "A", "A"], "composer": ["basis", "on_off", "basis"],
-        "chosen": [True, False, True],
-        "rms_percent_of_on_off": [1.0, 100.0, 2.0], "predicted_percent": [1.0, np.nan, 2.0],
-        "worst_line_volume_percent": [0.5, 90.0, np.nan],
-    }  # fmt: skip
-    artifacts.write_table("datasets/compose_parts/scores.parquet", SCORES, columns)
-    evidence = judge.judge(
-        NightlyLoop(artifacts=["x"], judge="deposition", cases="", recordings=""), project
-    ).measure(Path("datasets"))
-    assert evidence.cases == {"a, A": ("a, A", 1.0), "b, A": ("b, A", 2.0)} and evidence.guards == {
-        "worst_line_volume_percent": 0.5
-    }
+    score([1.0, 2.0, 0.0], [0.5, np.nan, 0.2])
+    evidence = measure(project, kind="deposition")
+    # no case costs nothing
+    assert evidence.cases == {"a, A": ("a, A", 1.0), "b, A": ("b, A", 2.0), "c, A": ("c, A", 1e-3)}
+    assert evidence.guards == {"worst_line_volume_percent": 0.5}
     # a challenger whose lines are not judged has no worst line, and is no better for it
-    columns["worst_line_volume_percent"] = [np.nan, 90.0, np.nan]
-    artifacts.write_table("datasets/compose_parts/scores.parquet", SCORES, columns)
-    unjudged = judge._deposition(Path("datasets"))
+    score([1.0], [np.nan])
+    unjudged = measure(project, kind="deposition")
     assert unjudged.guards == {}
-    decision = decide(evidence, unjudged, project.rule, allowed={}, alarms=(), seed=1)
+    decision = decided(evidence, unjudged._replace(panel=evidence.panel), project)
     assert decision.decision == KEPT and "guard worst_line_volume_percent is inf" in str(decision.reasons)
 
 
@@ -188,48 +196,25 @@ def test_a_setpoint_case_costs_the_runs_that_do_not_settle(project):
         ("ours", "recorded", "other", False, 10.0, 50.0),
         ("pid", "paper", "calm", True, 50.0, 9.0),
     ]
-    named = {
-        "controller": [r[0] for r in rows], "simulator": [r[1] for r in rows], "case": [r[2] for r in rows],
-        "counts": [r[3] for r in rows],
-        "settled_percent": [r[4] for r in rows], "p90_steps": [r[5] for r in rows],
-    }  # fmt: skip
+    keys = ("controller", "simulator", "case", "counts", "settled_percent", "p90_steps")
+    named = dict(zip(keys, map(list, zip(*rows, strict=True)), strict=True))
     filler = {
-        column.name: ["agent"] * 4
-        if str(column.type) == "string"
-        else np.ones(4, int)
-        if "int" in str(column.type)
-        else np.ones(4)
+        column.name: ["agent"] * 4 if str(column.type) == "string" else np.ones(4).astype(str(column.type))
         for column in tables.SCOREBOARD.columns
+        if column.name not in named
     }
     artifacts.write_table("datasets/evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD, filler | named)
     artifacts.write_json("datasets/evaluate_setpoint/choice.json", {"name": "ours"})
-    evidence = judge.judge(
-        NightlyLoop(artifacts=["x"], judge="setpoint", cases="", recordings=""), project
-    ).measure(Path("datasets"))
-    assert {name: cost for name, (_, cost) in evidence.cases.items()} == {
-        "paper: calm": 2.0,
-        "recorded: clog": 6.0,
-    }
+    evidence = measure(project, kind="setpoint")
+    costs = {name: cost for name, (_, cost) in evidence.cases.items()}
+    assert costs == {"paper: calm": 2.0, "recorded: clog": 6.0}
     assert evidence.guards == {"worst_unsettled_percent": 6.0, "slowest_p90_steps": 30.0}
-
-
-def test_a_file_of_cases_that_lacks_its_costs_is_refused(project):
-    artifacts.write_json(
-        "datasets/cases.json", {"panel": "a", "cases": {"one": {"block": "b"}}, "guards": {}}
-    )
-    loop = NightlyLoop(
-        artifacts=["datasets/cases.json"], judge="cases", cases="datasets/cases.json", recordings=""
-    )
-    with pytest.raises(
-        ValueError,
-        match="expected panel, cases with block and cost, and guards with value and allowed, found no 'cost'",
-    ):
-        judge.judge(loop, project).measure(Path("datasets"))
 
 
 @pytest.mark.parametrize(
     ("cases", "guard", "found"),
     [
+        ('{"one": {"block": "b"}}', "1", "found no 'cost'"),
         ('{"one": {"block": "b", "cost": 0}}', "1", "found one costs 0"),
         ('{"one": {"block": "b", "cost": NaN}}', "1", "found one costs nan"),
         ('{"one": {"block": "b", "cost": -1e308}}', "1", "found one costs -1e\\+308"),
@@ -242,71 +227,57 @@ def test_a_file_of_cases_that_lacks_its_costs_is_refused(project):
 )
 def test_a_file_of_cases_that_says_nothing_promotes_nothing(project, cases, guard, found):
     guards = f'{{"unstable": {{"value": {guard}, "allowed": 0}}}}'
-    text = f'{{"panel": "a", "cases": {cases}, "guards": {guards}}}'
-    artifacts.write_text("datasets/cases.json", text)
-    loop = NightlyLoop(
-        artifacts=["datasets/cases.json"], judge="cases", cases="datasets/cases.json", recordings=""
-    )
+    path = "datasets/cases.json"
+    artifacts.write_text(path, f'{{"panel": "a", "cases": {cases}, "guards": {guards}}}')
+    loop = NightlyLoop(artifacts=[path], judge="cases", cases=path, recordings="")
     with pytest.raises(ValueError, match=f"^datasets/cases.json: expected .*{found}"):
         judge.judge(loop, project).measure(Path("datasets"))
 
 
+def costs(cost: float, **guards: float) -> CaseCosts:
+    return CaseCosts("a", {f"case {k}": (f"plant {k}", cost) for k in range(8)}, guards)
+
+
 def test_what_costs_the_same_is_no_better_by_nothing_and_not_by_minus_nothing(project):
-    same = CaseCosts("a", {f"case {k}": (f"plant {k}", 1.0 + k) for k in range(8)}, {})
-    made = decide(same, same, project.rule, allowed={}, alarms=[], seed=1)
-    assert made.reasons == ["the challenger is no better: its cases cost 0.0 % more (0.0 to 0.0 %)"]
+    reasons = decided(costs(1.0), costs(1.0), project).reasons
+    assert reasons == ["the challenger is no better: its cases cost 0.0 % more (0.0 to 0.0 %)"]
 
 
 def test_a_first_champion_needs_a_case_and_a_count_of_unstable_plants(project):
-    fit = CaseCosts("a", {"one": ("b", 1.0)}, {"unstable_plants": 0.0})
-    for challenger, decision in (
-        (fit, FIRST),
-        (fit._replace(cases={}), KEPT),
-        (fit._replace(guards={"unstable_plants": np.nan}), KEPT),
-    ):
-        made = decide(None, challenger, project.rule, allowed={}, alarms=[], seed=1)
-        assert made.decision == decision, made
+    fit = costs(1.0, unstable_plants=0.0)
+    unfit = (fit._replace(cases={}), fit._replace(guards={"unstable_plants": np.nan}))
+    decisions = [decided(None, challenger, project).decision for challenger in (fit, *unfit)]
+    assert decisions == [FIRST, KEPT, KEPT]
 
 
 @pytest.mark.parametrize("loop", ["deposition", "setpoint"])
 def test_a_guard_may_be_worse_by_the_percentage_that_is_declared_and_no_more(project, loop):
     """5 % of 2.0 is 0.1: 2.1 passes and 2.11 does not."""
-    settings = project.model_copy(
-        update={"rule": project.rule.model_copy(update={"worst_case_percent": 5.0})}
-    )
+    settings = change(project, "rule", worst_case_percent=5.0)
     judged = judge.judge(NightlyLoop(artifacts=["x"], judge=loop, cases="", recordings=""), settings)
-    champion = CaseCosts("a", {f"part {k}": (f"part {k}", 2.0) for k in range(8)}, {"worst": 2.0})
+    champion = costs(2.0, worst=2.0)
     allowed = judged.allowed(champion)
     assert allowed == {"worst": pytest.approx(0.1)}
-    better = champion._replace(cases={name: (block, 1.0) for name, (block, _) in champion.cases.items()})
     for guard, decision in ((2.1, PROMOTED), (2.11, KEPT)):
-        decided = decide(
-            champion,
-            better._replace(guards={"worst": guard}),
-            project.rule,
-            allowed=allowed,
-            alarms=[],
-            seed=1,
-        )
-        assert decided.decision == decision, decided.reasons
+        assert decided(champion, costs(1.0, worst=guard), project, **allowed).decision == decision
 
 
 def test_the_temperature_loop_allows_its_worst_case_and_its_hold_out_a_percentage(project):
-    rule = project.rule.model_copy(update={"worst_case_percent": 5.0, "holdout_error_percent": 10.0})
-    settings = project.model_copy(update={"rule": rule})
-    champion = CaseCosts("a", {}, {"worst_case": 40.0, "holdout_error_degC": 0.5})
-    allowed = judge.judge(project.loops["temperature"], settings).allowed(champion)
-    assert allowed == {
+    settings = change(project, "rule", worst_case_percent=5.0, holdout_error_percent=10.0)
+    allowed = judge.judge(project.loops["temperature"], settings).allowed
+    assert allowed(costs(1.0, worst_case=40.0, holdout_error_degC=0.5)) == {
         "worst_case": pytest.approx(2.0),
-        "settled_error_degC": rule.settled_error_degC,
+        "settled_error_degC": settings.rule.settled_error_degC,
         "holdout_error_degC": pytest.approx(0.05),
     }
+    # what a champion did not measure may not be worse
+    assert allowed(costs(1.0, worst_case=40.0))["holdout_error_degC"] == 0.0
 
 
 def test_every_plant_start_and_reference_is_a_case_and_the_dearest_plant_guards(project):
     asked = {"starts_degC": [20.0, 60.0], "reference_offsets_degC": [0.0, 7.0], "plants": 3, "steps": 120}
-    settings = project.model_copy(update={"holdout": project.holdout.model_copy(update=asked)})
-    evidence = judge.judge(settings.loops["temperature"], settings).measure(Path("datasets"))
+    settings = change(project, "holdout", **asked)
+    evidence = measure(settings)
     reference = judge.frozen_panel(settings.holdout).machine.outputs[0].reference
     assert set(evidence.cases) == {
         f"plant {p}, {start:g} °C to {reference + offset:g} °C"
@@ -318,14 +289,6 @@ def test_every_plant_start_and_reference_is_a_case_and_the_dearest_plant_guards(
         np.mean([cost for block, cost in evidence.cases.values() if block == f"plant {p}"]) for p in range(3)
     ]
     assert evidence.guards["worst_case"] == pytest.approx(max(by_plant)) and max(by_plant) > min(by_plant)
-
-
-def test_weights_that_hold_another_versions_too_are_read_as_todays(project):
-    judged = judge.judge(project.loops["temperature"], project)
-    before = judged.measure(Path("datasets"))
-    path = "datasets/tune_weights/weights.json"
-    artifacts.write_json(path, artifacts.read_json(path) | {"practical": {"subspace_lqg": 3.0}})
-    assert judged.measure(Path("datasets")) == before
 
 
 def test_the_hold_out_error_is_the_root_mean_square_of_one_step(project):
@@ -372,22 +335,6 @@ def test_a_hold_out_recording_that_cannot_be_read_ends_the_judging_with_its_reas
         judge.frozen_panel(settings.holdout)
 
 
-def test_no_case_costs_nothing_and_what_a_champion_did_not_measure_may_not_be_worse(project):
-    columns = {
-        "part": ["a"], "material": ["A"], "composer": ["basis"], "chosen": [True],
-        "rms_percent_of_on_off": [0.0], "predicted_percent": [1.0],
-        "worst_line_volume_percent": [0.2],
-    }  # fmt: skip
-    artifacts.write_table("datasets/compose_parts/scores.parquet", SCORES, columns)
-    loop = NightlyLoop(artifacts=["x"], judge="deposition", cases="", recordings="")
-    evidence = judge.judge(loop, project).measure(Path("datasets"))
-    assert evidence.cases == {"a, A": ("a, A", 1e-3)}
-    assert evidence.guards == {"worst_line_volume_percent": 0.2}
-    champion = CaseCosts("a", {}, {"worst_case": 40.0})  # its hold-out was not measured: nothing may be worse
-    allowed = judge.judge(project.loops["temperature"], project).allowed(champion)
-    assert allowed["holdout_error_degC"] == 0.0
-
-
 def test_a_controller_is_designed_for_what_it_was_tuned_for_not_for_the_nights_cases(project, monkeypatch):
     """PI's gains depend on the horizon that its responses are followed over: a night of shorter cases would
     judge another PI than the pages."""
@@ -412,16 +359,12 @@ def test_a_controller_is_designed_for_what_it_was_tuned_for_not_for_the_nights_c
 
 
 def test_figures_beyond_meaning_are_words_in_the_night_s_sentences(project):
-    champion, useless = (
-        CaseCosts("a", {f"case {k}": (f"plant {k}", cost) for k in range(8)}, {"worst_case": cost})
-        for cost in (1.0, np.inf)
-    )
-    decided = decide(champion, useless, project.rule, allowed={}, alarms=[], seed=1)
-    assert decided.reasons[0] == (
+    decision = decided(costs(1.0, worst_case=1.0), costs(np.inf, worst_case=np.inf), project)
+    assert decision.reasons[0] == (
         "the challenger is no better: its cases cost beyond 1,000 % more (beyond 1,000 % to beyond 1,000 %)"
     )
     page = nightly_page.render(
-        [Night(1, "night-0001", "2030-01-01T02:00:00+00:00", decisions={"temperature": decided})],
+        [Night(1, "night-0001", "2030-01-01T02:00:00+00:00", decisions={"temperature": decision})],
         ChampionState(),
         project,
     )

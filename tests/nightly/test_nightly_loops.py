@@ -21,7 +21,7 @@ from pipeline.nightly import (
     verdicts,
     watch,
 )
-from pipeline.nightly.records import Alarm, DriftMemory, LoopDrift, Night, NightDrift, Remembered, to_json
+from pipeline.nightly.records import Alarm, Memory, Night, NightDrift
 from pipeline.nightly.settings import Nightly
 from pipeline.setpoint import tables
 from pipeline.store import artifacts, params
@@ -44,9 +44,7 @@ def project(empty, tmp_path, monkeypatch):
     """A project with one loop, whose stages score what the test says in place of `dvc repro`, and whose pages
     pass."""
     copy = entered(empty, tmp_path / "toy", monkeypatch)
-    monkeypatch.setattr(
-        verdicts, "read_verdicts", lambda settings, night: (dict(map(passing, settings.loops)), night)
-    )
+    monkeypatch.setattr(verdicts, "read_verdicts", lambda settings, night: dict(map(passing, settings.loops)))
     Path("dvc.lock").write_text("schema: '2.0'\nstages: {}\n")
     return copy
 
@@ -54,10 +52,6 @@ def project(empty, tmp_path, monkeypatch):
 def passing(loop: str) -> tuple[str, Verdict]:
     said = "Pass (simulation): ours.", "All six rules passed.", "", "", ""
     return loop, Verdict(loop, PASSED, *said, winner="ours", subject="ours", rehearsal=True)
-
-
-def remember(memory: Remembered) -> None:
-    artifacts.write_json(remembered.LAST, to_json(memory))
 
 
 def played(*_: None) -> tuple[dict, list]:
@@ -123,7 +117,7 @@ def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_gua
         project.record(f"night {k}", [10.0])
         Path("learn.py").write_text(f"# night {k}\n")  # something is new
         status, summary = night.nightly(render_night)
-        decided = remembered.nights()[-1].decisions[loop]
+        decided = remembered.read().nights[-1].decisions[loop]
         assert (
             status == reporting.OK and decided.decision == decision and reason in " ".join(decided.reasons)
         ), (summary, decided)
@@ -132,7 +126,9 @@ def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_gua
     present = champion.read().champions[loop]
     assert present.rehearsal and present.contestant == "ours"
     metrics = present.metrics
-    assert metrics and metrics.mean_cost == pytest.approx(8.0 + 0.35 + (1.0 if loop == "setpoint" else 0.0))
+    assert metrics and metrics["mean_cost"] == pytest.approx(
+        8.0 + 0.35 + (1.0 if loop == "setpoint" else 0.0)
+    )
 
 
 def test_a_loop_that_is_switched_off_is_no_part_of_the_night(project, monkeypatch):
@@ -141,11 +137,11 @@ def test_a_loop_that_is_switched_off_is_no_part_of_the_night(project, monkeypatc
     monkeypatch.setattr(
         reproducing, "reproduce", lambda *_, **__: played(deposition(10.0, 2.0), setpoint(10.0, 2.0))
     )
-    remember(Remembered(drift=DriftMemory(alarms=(alarm,)), recordings={"setpoint": {}}))
+    remembered.write(Memory(alarms=[alarm], recordings={"setpoint": {}}))
     project.set(loops_on={"setpoint": False}, loops=own)
     status, summary = night.nightly(render_night)
-    tonight = remembered.nights()[-1]
-    assert status == reporting.OK and tonight.promoted == ("deposition",), summary
+    tonight = remembered.read().nights[-1]
+    assert status == reporting.OK and tonight.promoted == ["deposition"], summary
     assert "no part of the night, by section loops: setpoint" in summary
     assert list(tonight.decisions) == list(champion.read().champions) == ["deposition"]
     assert not tonight.drift.alarms
@@ -208,11 +204,15 @@ def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(
 
 def test_the_gravest_of_a_night_is_its_exit_status():
     alarm = Alarm("toy", "key", "a.csv", "cause", 9.0)
-    quiet = Night(1, "night-0001", "2030-01-01T02:00:00+00:00", "kept")
-    set_aside = quiet._replace(quarantined={"a.csv": "reason"})
-    drifted = set_aside._replace(drift=NightDrift({"toy": LoopDrift.none("toy")._replace(alarms=[alarm])}))
-    gravest = (quiet, set_aside, drifted, drifted.ended("failed"), quiet._replace(unpushed=True))
-    assert [reporting.exit_status(record) for record in gravest] == [0, 4, 3, 1, 1]
+
+    def status(outcome: str = "kept", *, unpushed: bool = False, **drift) -> int:
+        night = Night(1, "night-0001", "2030-01-01T02:00:00+00:00", outcome, drift=NightDrift(**drift))
+        night.unpushed = unpushed
+        return reporting.exit_status(night)
+
+    both = {"quarantined": {"a.csv": "reason"}, "alarms": [alarm]}
+    assert (status(), status(quarantined={"a.csv": "reason"}), status(**both)) == (0, 4, 3)
+    assert status("failed", **both) == status(unpushed=True) == 1
 
 
 def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project, monkeypatch):
@@ -234,8 +234,9 @@ def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project,
     ):
         by_hand.accept("deposition", "a new camera")
     before = project.production_of("deposition")
-    memory = DriftMemory(("deposition: camera",), drifted={"deposition": ["trial_8.mcap"]})
-    remember(remembered.last()._replace(drift=memory))
+    memory = remembered.read()
+    memory.pending, memory.drifted = ["deposition: camera"], {"deposition": ["trial_8.mcap"]}
+    remembered.write(memory)
     monkeypatch.setattr(
         screening,
         "reference",
@@ -244,9 +245,8 @@ def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project,
     assert "is held against trial_8.mcap from now on" in by_hand.accept("deposition", "a new camera")
     after = project.production_of("deposition")
     assert artifacts.read_json("champion/deposition/reference.json")["camera"] == ["trial_8.mcap"]
-    assert {name: after[name] for name in before} == before and remembered.last().drift.drifted == {
-        "deposition": []
-    }
+    assert {name: after[name] for name in before} == before
+    assert remembered.read().drifted == {"deposition": []}
     line = champion.read().history[-1]
     assert (line.event, line.why, line.run) == ("drift accepted", "a new camera", "night-0001")
     assert not any(entry.endswith(("champion.json", ".dvc")) for entry in project.dirty())
@@ -265,17 +265,18 @@ def test_an_alarm_of_the_setpoint_camera_changes_nothing_for_another_loop(projec
     raised = Alarm(
         "setpoint", "setpoint: contrast", "print_8.csv", "the line stands out by 25 gray levels", 9.0
     )
-    memory = DriftMemory((), (raised,), {"setpoint": ["print_8.csv"]}, night=1)
-    remember(remembered.last()._replace(drift=memory))
+    memory = remembered.read()
+    memory.alarms, memory.drifted = [raised], {"setpoint": ["print_8.csv"]}
+    remembered.write(memory)
     monkeypatch.setattr(
         reproducing, "reproduce", lambda *_, **__: played(deposition(5.0, 2.0), setpoint(5.0, 2.0))
     )
     Path("learn.py").write_text("# something is new\n")
     status, summary = night.nightly(render_night)
-    tonight = remembered.nights()[-1]
+    tonight = remembered.read().nights[-1]
     # the setpoint loop, whose camera it is, keeps its champion; the other is promoted as on any night
-    assert status == reporting.DRIFTED and tonight.promoted == ("deposition",), summary
-    assert tonight.drift.of("setpoint").alarms == [raised] and tonight.drift.of("deposition").alarms == []
+    assert status == reporting.DRIFTED and tonight.promoted == ["deposition"], summary
+    assert tonight.drift.alarms == [raised]
     assert not any("drift" in reason for reason in tonight.decisions["deposition"].reasons)
     assert "drift: the line stands out" in " ".join(tonight.decisions["setpoint"].reasons)
     html = Path("reports/nightly.html").read_text()

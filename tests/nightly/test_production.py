@@ -5,26 +5,15 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
 
 from pipeline.cli import render_night
-from pipeline.nightly import champion, inputs, night, processes, reporting
+from pipeline.nightly import champion, inputs, night, reporting, reproducing
 from pipeline.nightly.records import Champion, ChampionState
 from pipeline.recordings import excluded
 from pipeline.store import artifacts, params
 from pipeline.verdict import verdict
 from tests.conftest import ROOT
-from tests.nightly.toy_nights import SETTINGS, Project, entered
-
-
-@pytest.fixture(scope="module")
-def first(tmp_path_factory):
-    return Project(tmp_path_factory.mktemp("production") / "toy").make().promoted()
-
-
-@pytest.fixture
-def project(first, tmp_path, monkeypatch):
-    return entered(first, tmp_path / "toy", monkeypatch)
+from tests.nightly.toy_nights import SETTINGS, Project
 
 
 def put(state: ChampionState, run: str, loop: str = "toy", event: str = "promoted") -> ChampionState:
@@ -146,47 +135,7 @@ def test_who_keeps_a_recording_goes_by_its_own_name_and_not_by_a_pattern(project
     assert kept.exists() and (inputs.QUARANTINE / "toy/shift [1].csv").exists()
 
 
-# ---- paths and stages
-
-
-@pytest.mark.parametrize(
-    "name", ["a b.py", "ü.py", 'quo"te.py', "new\nline.py", " leading.py", "dvc.lock", "x -> y.py"]
-)
-def test_a_changed_path_is_named_whole_whatever_its_characters(tmp_path, monkeypatch, name):
-    project = Project(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    project.run("git", "init", "-q", "-b", "main")
-    for file in (name, "zz.py"):
-        (tmp_path / file).write_text("1")
-    project.run("git", "add", "-A")
-    project.run("git", "-c", "user.name=S", "-c", "user.email=s@e", "commit", "-qm", "files")
-    (tmp_path / name).write_text("2")
-    assert processes.changed() == [name]
-    project.run("git", "mv", "zz.py", "moved.py")
-    assert set(processes.changed()) == {name, "zz.py", "moved.py"}
-    (tmp_path / "new.py").write_text("")
-    assert processes.changed("new.py") == [] and processes.changed("new.py", untracked="all") == ["new.py"]
-
-
-WIRING = yaml.safe_load((ROOT / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
-
-
-def depending_on(place: str) -> set[str]:
-    """The stages that may run again where something below `place` is new, by the project's own wiring."""
-
-    def outs(stage: str) -> list[str]:
-        every = [*WIRING[stage].get("outs", []), *WIRING[stage].get("metrics", [])]
-        return [out if isinstance(out, str) else next(iter(out)) for out in every]
-
-    touched, stages = [place], set()
-    while touched:
-        here = touched.pop()
-        for stage in WIRING.keys() - stages:
-            deps = WIRING[stage].get("deps", [])
-            if any(f"{dep}/".startswith(f"{here}/") or f"{here}/".startswith(f"{dep}/") for dep in deps):
-                stages.add(stage)
-                touched += outs(stage)
-    return stages
+# ---- what runs again
 
 
 @pytest.mark.parametrize(
@@ -201,5 +150,12 @@ def depending_on(place: str) -> set[str]:
         ("setpoint", "train_classifier evaluate_setpoint certify verdict export_controllers report"),
     ],
 )
-def test_a_new_recording_reruns_the_stages_of_its_own_loop_and_the_pages(loop, stages):
-    assert depending_on(f"datasets/raw/{loop}") == set(stages.split())
+def test_a_new_recording_reruns_the_stages_of_its_own_loop_and_the_pages(monkeypatch, loop, stages):
+    monkeypatch.chdir(ROOT)
+    place = f"datasets/raw/{loop}/"
+    wired = reproducing.read_stages("dvc.yaml")
+    readers = {
+        name for name, stage in wired.items() if any(place.startswith(f"{dep}/") for dep in stage["deps"])
+    }
+    upstream = reproducing.read_upstream()
+    assert {name for name in wired if upstream[name] & readers} == set(stages.split())

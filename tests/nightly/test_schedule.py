@@ -13,7 +13,7 @@ import yaml
 
 from pipeline.nightly import champion, reporting
 from tests.conftest import ROOT
-from tests.nightly.toy_nights import Project, entered
+from tests.nightly.toy_nights import Project
 
 STEPS = yaml.safe_load((ROOT / "schedules/github-nightly.yml").read_text(encoding="utf-8"))["jobs"][
     "nightly"
@@ -87,15 +87,9 @@ def get_production(project: Project, branch: str = "main") -> list[str]:
     return [line["run"] for line in state["history"]]
 
 
-@pytest.fixture(scope="module")
-def first(tmp_path_factory):
-    return Project(tmp_path_factory.mktemp("schedule") / "toy").make().promoted()
-
-
 @pytest.fixture
-def hosted(first, tmp_path, monkeypatch):
+def hosted(project, tmp_path):
     """The project of a person, and a runner, with one server."""
-    project = entered(first, tmp_path / "toy", monkeypatch)
     project.run("dvc", "remote", "add", "-q", "-d", "store", str(tmp_path / "remote"))
     project.set(remote="store")
     Path("run").write_text(RUN)
@@ -126,7 +120,7 @@ def test_the_job_merges_what_was_pushed_meanwhile_and_remembers_the_night(hosted
     # the next machine has the memory and the champion
     clone, ended = runner.work()
     assert ended == {"pull": 0, "night": reporting.OK, "push": 0}, runner.printed
-    last = json.loads((clone.folder / ".beadline/last.json").read_text())
+    last = json.loads((clone.folder / ".beadline/memory.json").read_text())
     assert last["night"] == 3 and last["idle"] == 1
     assert clone.production()["learn/model.json"] == b"10.0"
 

@@ -33,21 +33,21 @@ ALARM = {
     "number": 2, "run": "night-0002", "when": "2030-01-09T02:00:00+00:00", "outcome": "kept",
     "notes": ["the clock was set back by 3 h"], "seconds": 8.0,
     "new_recordings": {"temperature": [FILE]},
-    "quarantined": {FILE: f"{FILE}: 3 columns, 5 expected <script>alert(1)</script>"},
     "decisions": {"temperature": JUDGED},
-    "promoted": [], "reasons": [],
-    "drift": {"loops": {"temperature": {"loop": "temperature",
+    "reasons": [],
+    "drift": {
         "alarms": [{"loop": "temperature", "key": "k", "recording": FILE, "cause": CAUSE, "sigmas": -9.4,
         "consequences": ["closed loop: sensor_1 settles -1.4 °C off"]}],
-        "watched": [], "figures": {FILE: DRIFT}, "quarantined": {}, "notes": [],
-    }}},
+        "watched": [], "figures": {FILE: DRIFT}, "notes": [],
+        "quarantined": {FILE: f"{FILE}: 3 columns, 5 expected <script>alert(1)</script>"},
+    },
 }  # fmt: skip
 FIRST = ALARM | {
     "number": 1, "run": "night-0001", "when": "2030-01-08T02:00:00+00:00", "outcome": "promoted",
-    "promoted": ["temperature"], "quarantined": {}, "notes": [],
+    "notes": [],
     "decisions": {"temperature": {"decision": "first champion",
     "reasons": ["there was no champion to compare with"], "guards": {}}},
-    "drift": {"loops": {}},
+    "drift": {},
 }  # fmt: skip
 ENTRY = {
     "run": "night-0001",
@@ -122,9 +122,8 @@ def test_a_sensor_that_stands_still_is_the_pages_first_sentence_and_its_first_al
         "loop": "temperature", "key": "k", "recording": FILE, "sigmas": 99.9, "kind": "sensor",
         "cause": "sensor_2 stands still at 110.0 °C while heater_2 heats.", "channel": "sensor_2",
     }  # fmt: skip
-    measured = ALARM["drift"]["loops"]["temperature"]
-    alarms = {"alarms": [*measured["alarms"], dead]}
-    night = ALARM | {"drift": {"loops": {"temperature": measured | alarms}}}
+    measured = ALARM["drift"]
+    night = ALARM | {"drift": measured | {"alarms": [*measured["alarms"], dead]}}
     settings = params.load(Nightly, "nightly", ROOT / "params.yaml")
     html = nightly_page.render(
         [from_json(Night, FIRST), from_json(Night, night)], from_json(ChampionState, STATE), settings

@@ -112,6 +112,14 @@ def test_pictures_none_of_which_can_be_read_end_the_watch_with_one_sentence(comm
     assert status == 1 and wrong.count("\n") == 1
     assert wrong.startswith(f"beadline: in: none of {count} frames can be read: f")
     assert "a picture of 16 bytes without its end" in wrong
+    # nothing is left of it, and what was there before stays
+    assert not Path("shadow").exists()
+    Path("shadow").mkdir()
+    Path("shadow/index.html").write_text("of a good watch")
+    command("shadow", "in", "--once")
+    assert {path.name: path.read_text() for path in Path("shadow").iterdir()} == {
+        "index.html": "of a good watch"
+    }
 
 
 def test_the_default_watches_a_folder(command, trained):

@@ -6,7 +6,7 @@ import contextlib
 import signal
 import sys
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,8 +52,10 @@ def watch(
 ) -> Watched:
     """Watches until `stopped`, or with asked.once until the source ends; `place` is its name as shown.
 
-    The page and the decisions stand in `out`. Raises OSError where not even the first page can be written.
+    The page and the decisions stand in `out`; if no frame could be read, `out` is as it was before. Raises
+    OSError where not even the first page can be written.
     """
+    earlier = {path: path.read_bytes() for path in out.glob("index.html")} if out.is_dir() else None
     about = {"source": place, "controller": deployed.name, "sent": "nothing"}
     log, windows, mind = (
         DecisionLog(out, about),
@@ -108,7 +110,21 @@ def watch(
     why = f"expected {counted(deployed.window, 'frame')} in a row at one flow{broken}"
     why = why if frames else source.waits_for or f"it lacks {source.lacks}"
     unreadable = "" if readable else broken.removeprefix("; ")
+    if unreadable:
+        _put_back(out, [page, *log.written], earlier)
     return Watched(frames, mind.number, changes, held, page, first, why, unreadable)
+
+
+def _put_back(out: Path, written: Sequence[Path], earlier: Mapping[Path, bytes] | None) -> None:
+    """Leaves nothing of a watch in `out`; `earlier` are its files of before that were written over, None if
+    there was no such folder."""
+    for path in written:
+        path.unlink(missing_ok=True)
+    for path, content in (earlier or {}).items():
+        artifacts.write_bytes(path, content)
+    if earlier is None:
+        with contextlib.suppress(OSError):  # somebody has put a file there meanwhile
+            out.rmdir()
 
 
 def summary_lines(watched: Watched, place: str) -> str:

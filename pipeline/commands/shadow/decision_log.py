@@ -75,12 +75,14 @@ def write_decisions(path: Path, rows: list[tuple[int, Mapping[str, Any]]], about
 
 class DecisionLog:
     """Files decisions-0000.mcap, decisions-0001.mcap, ... of a folder, numbered on from those that are
-    there. What could not be written, as on a full disk, is kept and tried again; `trouble` says why."""
+    there. What could not be written, as on a full disk, is kept and tried again; `trouble` says why.
+    `written` are its files."""
 
     def __init__(self, folder: Path, about: Mapping[str, str]) -> None:
         self.folder, self.about = folder, about
         self.rows: list[tuple[int, Mapping[str, Any]]] = []
         self.saved, self.saved_at, self.trouble = 0, -EVERY_S, ""
+        self.written: list[Path] = []
         names = [path.name for path in folder.glob("decisions-*.mcap")] if folder.is_dir() else []
         numbers = [int(found[1]) for name in names if (found := re.fullmatch(r"decisions-(\d+)\.mcap", name))]
         self.number = max(numbers, default=-1) + 1
@@ -99,6 +101,7 @@ class DecisionLog:
         self.saved_at = time.monotonic()
         if self.saved == len(self.rows):
             return
+        self.written.append(self.path)
         try:
             write_decisions(self.path, self.rows, self.about)
         except OSError as error:

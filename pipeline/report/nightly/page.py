@@ -13,11 +13,10 @@ from pipeline.nightly.records import (
     SENSOR,
     Champion,
     ChampionState,
-    Guard,
     HistoryLine,
     LoopDecision,
     Night,
-    RecordShare,
+    sort_alarms,
 )
 from pipeline.nightly.settings import Nightly
 from pipeline.report.shared import charts, page
@@ -59,13 +58,13 @@ def render(nights: Sequence[Night], state: ChampionState, settings: Nightly) -> 
         candidates=_champions(state.candidates),
         decisions=[_decision(name, decision) for name, decision in tonight.decisions.items()],
         drift=_drift(measured, settings) if measured else None,
-        alarms=tonight.drift.alarms,
+        alarms=sort_alarms(tonight.drift.alarms),
         watched=tonight.drift.watched,
         pictures=_pictures(nights, settings),
         nights=[_row(night) for night in reversed(nights[-SHOWN:])],
         more=max(len(nights) - SHOWN, 0),
         history=[_line(line) for line in reversed(state.history)],
-        quarantined=tonight.quarantined,
+        quarantined=tonight.drift.quarantined,
         notes=tonight.notes,
         used=[_used(path, share, tonight) for path, share in tonight.used.items()],
         watch=_watch(nights, settings),
@@ -111,7 +110,7 @@ def _head(night: Night) -> tuple[str, str]:
         head = f"{head} {passes[:1].upper()}{passes[1:]}." if promoted else f"Nothing is promoted: {passes}."
     if night.lost:
         return f"Failed: {', '.join(night.lost)}. {head}", FAILED
-    if night.quarantined:
+    if night.drift.quarantined:
         return f"{head} Bad recordings are set aside.", FAILED
     return head, OPEN if candidates and not promoted else PASSED
 
@@ -128,12 +127,12 @@ def _dead_sensors(night: Night) -> list[str]:
 def _verdict(night: Night) -> dict[str, Any]:
     head, kind = _head(night)
     drifted = [] if night.outcome == records.FAILED else _drifted(night)
-    causes = [alarm.cause for alarm in night.drift.alarms]
+    causes = [alarm.cause for alarm in sort_alarms(night.drift.alarms)]
     reasons = (
         # of the loops that did not drift is said what is said on any night
         [*causes, *_reasons(night, without=drifted)]
         if drifted
-        else [*_reasons(night), *night.quarantined.values()]
+        else [*_reasons(night), *night.drift.quarantined.values()]
     )
     return {
         "state": {FAILED: "failed", PASSED: "passed"}.get(kind, "open"),
@@ -168,7 +167,7 @@ def _remedy(night: Night, drifted: Sequence[str]) -> str:
             else "To go back: ./run beadline rollback."
         ),
     }.get(night.outcome, "")
-    if not night.quarantined:
+    if not night.drift.quarantined:
         return remedy
     set_aside = (
         "They lie in datasets/quarantine, unchanged, each with its reason beside it; mend them and put them "
@@ -231,18 +230,13 @@ def _decision(name: str, decision: LoopDecision) -> dict[str, Any]:
     }
 
 
-def _guard(name: str, guard: Guard) -> dict[str, Any]:
-    return {
-        "name": GUARDS.get(name, name),
-        "champion": _figure(guard.champion),
-        "challenger": _figure(guard.challenger),
-        "allowed": _figure(guard.allowed),
-        "bad": _worse_than_allowed(guard),
-    }
+def _guard(name: str, guard: Mapping[str, float | None]) -> dict[str, Any]:
+    figures = {key: _figure(value) for key, value in guard.items()}
+    return {"name": GUARDS.get(name, name), **figures, "bad": _worse_than_allowed(guard)}
 
 
-def _worse_than_allowed(guard: Guard) -> bool:
-    champion, challenger, allowed = guard
+def _worse_than_allowed(guard: Mapping[str, float | None]) -> bool:
+    champion, challenger, allowed = guard["champion"], guard["challenger"], guard["allowed"]
     if champion is None or challenger is None or allowed is None:
         return False
     return challenger > champion + allowed + 1e-9 * abs(champion)
@@ -275,12 +269,11 @@ def _rule(settings: Nightly) -> str:
     )
 
 
-def _used(path: str, share: RecordShare, night: Night) -> dict[str, str]:
+def _used(path: str, share: Mapping[str, float], night: Night) -> dict[str, str]:
     """How much of a new recording was used, and the smallest changes that it could have shown."""
-    figures = night.drift.figures.get(path)
-    parts = (share.used_percent, share.masked_percent, share.cut_percent)
-    columns = dict(zip(("used", "masked", "cut"), (quantity(part, "%", 0) for part in parts), strict=True))
-    return {"recording": path, **columns, "least": figures.least if figures else ""}
+    columns = {name: quantity(share[f"{name}_percent"], "%", 0) for name in ("used", "masked", "cut")}
+    least = night.drift.figures.get(path, {}).get("least", "")
+    return {"recording": path, **columns, "least": least}
 
 
 # ---- drift
@@ -290,34 +283,34 @@ def _drift(night: Night, settings: Nightly) -> dict[str, Any]:
     path, figures = list(night.drift.figures.items())[-1]
     limit = settings.drift.parameter_percent
     rows = [
-        {"name": name, "value": quantity(change.percent, "%", 1),
-        "band": f"± {quantity(change.band_percent, '%', 1)}", "sigmas": number(change.sigmas, 1),
-         "svg": _interval(name, change.percent, change.band_percent, limit),
-         "bad": abs(change.percent) >= limit and abs(change.sigmas) >= settings.drift.watch_sigmas}
-        for name, change in figures.parameters.items()
+        {"name": name, "value": quantity(change["percent"], "%", 1),
+        "band": f"± {quantity(change['band_percent'], '%', 1)}", "sigmas": number(change["sigmas"], 1),
+         "svg": _interval(name, change["percent"], change["band_percent"], limit),
+         "bad": abs(change["percent"]) >= limit and abs(change["sigmas"]) >= settings.drift.watch_sigmas}
+        for name, change in figures["parameters"].items()
     ]  # fmt: skip
     innovation = [
         {
             "name": output,
-            "noise": quantity(errors.noise_percent, "%", 0),
-            "noise_sigmas": number(errors.noise_sigmas, 1),
-            "mean": beyond_meaning(errors.mean_degC, "°C") or f"{short(errors.mean_degC, 2)} °C",
-            "mean_sigmas": number(errors.mean_sigmas, 1),
+            "noise": quantity(errors["noise_percent"], "%", 0),
+            "noise_sigmas": number(errors["noise_sigmas"], 1),
+            "mean": beyond_meaning(errors["mean_degC"], "°C") or f"{short(errors['mean_degC'], 2)} °C",
+            "mean_sigmas": number(errors["mean_sigmas"], 1),
         }
-        for output, errors in figures.innovation.items()
+        for output, errors in figures.get("innovation", {}).items()
     ]
-    by_sigmas = ((abs(change.sigmas), name, change) for name, change in figures.closed_loop.items())
-    worst = sorted(by_sigmas, reverse=True)[:6]
+    changes = figures.get("closed_loop", {}).items()
+    worst = sorted(((abs(one["sigmas"]), name, one["moved"], one["sigmas"]) for name, one in changes))[:-7:-1]
     return {
         "recording": path,
         "run": night.run,
         "rows": rows,
         "innovation": innovation,
         "limit": f"{limit:g}",
-        "not_applicable": figures.not_applicable,
+        "not_applicable": figures.get("not_applicable", ""),
         "loop": [
-            {"name": _words(name), "moved": number(change.moved, 2), "sigmas": number(change.sigmas, 1)}
-            for _, name, change in worst
+            {"name": _words(name), "moved": number(moved, 2), "sigmas": number(sigmas, 1)}
+            for _, name, moved, sigmas in worst
         ],
     }
 
@@ -366,9 +359,9 @@ def _pictures(nights: Sequence[Night], settings: Nightly) -> list[dict[str, Any]
     x, y = [], []
     for night in nights:
         if figures := night.drift.figures.values():
-            changes = [change for recording in figures for change in recording.parameters.values()]
+            changes = [change for recording in figures for change in recording["parameters"].values()]
             x.append(night.number)
-            y.append(max(abs(change.sigmas) for change in changes))
+            y.append(max(abs(change["sigmas"]) for change in changes))
     if len(x) < 2:
         return []
     top = max(*y, settings.drift.alarm_sigmas) * 1.15
@@ -395,11 +388,11 @@ def _pictures(nights: Sequence[Night], settings: Nightly) -> list[dict[str, Any]
 
 
 def _row(night: Night) -> dict[str, Any]:
-    causes = [alarm.cause for alarm in night.drift.alarms]
+    causes = [alarm.cause for alarm in sort_alarms(night.drift.alarms)]
     state = OPEN if night.outcome in (records.NOTHING_NEW, records.CANDIDATE) else PASSED
-    if night.outcome == records.FAILED or night.lost or night.quarantined or causes:
+    if night.outcome == records.FAILED or night.lost or night.drift.quarantined or causes:
         state = FAILED
-    reasons = "; ".join([*_reasons(night), *night.quarantined.values()])
+    reasons = "; ".join([*_reasons(night), *night.drift.quarantined.values()])
     return {
         "run": night.run,
         "when": _when(night.when),
