@@ -123,7 +123,7 @@ def compare(
 
     machine, setting = loaded.machine, loaded.setting
     outcomes, supervised, refused = evaluate_all(loaded, execution)
-    entrants = [name for name in outcomes if BY_NAME[name].role != "yardstick"]
+    entrants = [name for name in outcomes if BY_NAME[name].kind != "reference"]
     summary: dict[str, Any] = {
         **conditions(machine, loaded.panel, setting),
         "contestants": {
@@ -140,7 +140,8 @@ def compare(
         "order": entrants,
         "refused": refused,
     }
-    summary |= evaluation.decide(outcomes, entrants, summary, setting, settings.seed)
+    tuned = {name: values.get("cost", math.inf) for name, values in loaded.weights.items()}
+    summary |= evaluation.decide(outcomes, entrants, summary, setting, tuned, settings.seed)
     summary["redesigned"] = redesigns(entrants, loaded)
     typical = evaluation.typical_case(outcomes, entrants)
     drawn = {"typical": typical, "deciding": summary["deciding"]["case"]}

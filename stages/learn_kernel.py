@@ -1,6 +1,7 @@
 """Learn controllers from the record alone: reads datasets/ingest/record.parquet; writes
-datasets/learn_kernel/window.parquet and, if the record determines it, kernel.parquet: what the data say
-whatever the weights, so that new weights need no pass over the data."""
+datasets/learn_kernel/window.parquet and, if the record determines them, kernel.parquet and
+trajectories.parquet: what the data say whatever the weights, so that new weights need no pass over the
+data."""
 
 from __future__ import annotations
 
@@ -16,11 +17,17 @@ from pipeline.temperature import tables
 from pipeline.temperature.settings import Panel, Plant, Tracking, recorded
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
 
     from pipeline.temperature.controllers.feed_forward import Told
+    from pipeline.temperature.controllers.predictive import Trajectories
     from pipeline.temperature.controllers.window import WindowModel
-    from pipeline.temperature.test_set.scorecard import KernelCandidate
+    from pipeline.temperature.test_set.scorecard import CommonCost, KernelCandidate, Scenarios
+    from pipeline.temperature.tracking import Law
+
+    Segments = Sequence[np.ndarray]
 
 
 class LearnKernel(Section):
@@ -28,6 +35,7 @@ class LearnKernel(Section):
 
     longest_window: int = Field(ge=1, le=200)
     largest_kernel_window: int = Field(ge=1, le=10)
+    longest_horizon: int = Field(ge=5, le=200)
     offset: bool
     gain_spread: float = Field(ge=0, le=1)
     allowed_gap_percent: float = Field(gt=0, le=100)
@@ -60,6 +68,9 @@ METRICS = (
     "rank",
     "condition",
     "candidates.*.gap_on_window_model_percent",
+    "predictive.horizon",
+    "predictive.samples_needed",
+    "predictive.half_record_excess_percent",
 )
 
 
@@ -99,16 +110,28 @@ def main() -> None:
         x0, u0 = hold_output(model, np.full(model.p, start_degC))
         r = np.array([[o.reference for o in machine.outputs]], float)
         scenarios = Scenarios([model], np.zeros(1, int), x0[None], u0[None], r, panel.steps, hold=0)
+        weights = np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma
+
+        def halved(u: Segments, y: Segments) -> Law:
+            half = window.learn(
+                u, y, longest=long.N, offset=settings.offset, gain_spread=settings.gain_spread
+            )
+            return window.law(half, *weights)
+
+        # never fewer samples than twice the numbers of one output's predictor: below that the half-record
+        # test itself means nothing
         half_gap, needed = scorecard.sufficiency(
             u,
             y,
-            long,
+            halved,
             yardstick,
             scenarios,
+            whole=scorecard.optimum(scenarios, yardstick)[0],
+            samples=long.samples,
+            least=2 * (long.Theta.shape[1] + settings.offset),
             allowed=settings.allowed_gap_percent / 100,
-            offset=settings.offset,
-            gain_spread=settings.gain_spread,
         )
+        trajectories, predictive = learn_trajectories(settings, u, y, long, yardstick, scenarios)
         candidates = scorecard.kernel_candidates(
             u, y, long, yardstick, scenarios, largest=settings.largest_kernel_window, offset=settings.offset
         )
@@ -118,9 +141,62 @@ def main() -> None:
             artifacts.write_arrays(out / "feed_forward.parquet", "feed_forward", 1, feed_forward.stored(told))
         if best.learned is not None:
             artifacts.write_arrays(out / "kernel.parquet", "kernel", 1, best.learned.stored())
-        shown = figures(settings, long, half_gap, needed, candidates, best)
+        if trajectories is not None:
+            factors = trajectories.stored()
+            artifacts.write_arrays(out / "trajectories.parquet", "trajectories", 1, factors)
+        shown = figures(settings, long, half_gap, needed, candidates, best, predictive)
         shown["forward"] = forward_figures(machine, told)
         artifacts.write_metrics("learn_kernel", shown, METRICS)
+
+
+def learn_trajectories(
+    settings: LearnKernel,
+    u: Segments,
+    y: Segments,
+    long: WindowModel,
+    yardstick: CommonCost,
+    scenarios: Scenarios,
+) -> tuple[Trajectories | None, dict[str, Any]]:
+    """The factors of predictive control on the window of `long`, with the horizon that the record carries,
+    and whether the record is long enough for its noise; None and why, if the record does not determine
+    them."""
+    import numpy as np
+
+    from pipeline.temperature.controllers import predictive
+    from pipeline.temperature.test_set import scorecard
+
+    m, p = u[0].shape[1], y[0].shape[1]
+
+    def learn(u: Segments, y: Segments) -> Trajectories:
+        return predictive.learn(u, y, long.N, T, gain_spread=settings.gain_spread)
+
+    def law(learned: Trajectories) -> Law:
+        return predictive.law(learned, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma)
+
+    try:
+        T = predictive.horizon(long.samples, long.N, m, p, longest=settings.longest_horizon)
+        learned = learn(u, y)
+        run = scorecard.simulate(scenarios, law(learned))
+        half_excess, needed = scorecard.sufficiency(
+            u,
+            y,
+            lambda half_u, half_y: law(learn(half_u, half_y)),
+            yardstick,
+            scenarios,
+            whole=scorecard.cost(scenarios, run, yardstick)[0],
+            samples=learned.samples,
+            least=2 * predictive.ROWS * (1 + long.N * (m + p) + T * m),
+            allowed=settings.allowed_gap_percent / 100,
+        )
+    except ValueError as refusal:
+        return None, {"refused": str(refusal)}
+    return learned, {
+        "refused": None,
+        "horizon": T,
+        "samples": learned.samples,
+        "samples_needed": needed,
+        "half_record_excess_percent": 100 * half_excess,
+    }
 
 
 def forward_figures(machine: Plant, told: Told | None) -> dict[str, Any]:
@@ -148,8 +224,13 @@ def figures(
     needed: int,
     candidates: list[KernelCandidate],
     best: KernelCandidate,
+    predictive: dict[str, Any],
 ) -> dict[str, Any]:
     kernel = best.learned
+    reasons = {
+        "learned_kernel": None if kernel else best.refusal,
+        "predictive_control": predictive["refused"],
+    }
     return {
         "window": long.N,
         "samples": long.samples,
@@ -158,6 +239,7 @@ def figures(
         "samples_needed_for_noise": needed,
         "state": best.state if kernel else None,
         "refused": None if kernel else best.refusal,
+        "undetermined": {name: reason for name, reason in reasons.items() if reason},
         "rank": kernel.rank if kernel else None,
         "identifiable": kernel.unknowns if kernel else None,
         "samples_needed": kernel.unknowns if kernel else None,
@@ -169,6 +251,7 @@ def figures(
             }
             for c in candidates
         },
+        "predictive": predictive,
     }
 
 

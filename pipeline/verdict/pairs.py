@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from pipeline.temperature.controllers.table import BY_NAME
-from pipeline.verdict.controllers import DATA_DRIVEN, INDIRECT, MODEL_BASED, in_a_sentence
+from pipeline.temperature.controllers.table import BY_NAME, answering_pair
+from pipeline.verdict.controllers import in_a_sentence
 from pipeline.verdict.digits import band, number
 from pipeline.verdict.evidence import Figures, entry
 from pipeline.verdict.temperature import comparison, finite, names, refused
@@ -19,13 +19,12 @@ class PairSentence(NamedTuple):
 
 
 def pair_names(figures: Figures) -> tuple[str, str]:
-    """The model-based controller and the data-driven one, or a second model-based one if the kernel is
-    refused."""
+    """The model-based controller and the data-driven one, or a second model-based one if every data-driven
+    one is refused."""
     pair = entry(comparison(figures), "pair")
     if isinstance(pair, Mapping) and {"a", "b"} <= pair.keys():
         return str(pair["a"]), str(pair["b"])
-    without_kernel = DATA_DRIVEN in refused(figures) and INDIRECT in names(figures)
-    return MODEL_BASED, INDIRECT if without_kernel else DATA_DRIVEN
+    return answering_pair(names(figures), {})
 
 
 def pair_sentence(figures: Figures) -> PairSentence:
@@ -33,9 +32,9 @@ def pair_sentence(figures: Figures) -> PairSentence:
     p = 0.01)", or that there is no difference. `difference` is that of the cheaper one."""
     pair = entry(comparison(figures), "pair")
     a, b = pair_names(figures)
-    reason_of = refused(figures).get(DATA_DRIVEN)
-    instead = f"The learned kernel is refused: {reason_of}." if reason_of and b != DATA_DRIVEN else ""
     compared = b not in BY_NAME or BY_NAME[b].kind == "data-driven"
+    reasons = {name: why for name, why in refused(figures).items() if BY_NAME[name].kind == "data-driven"}
+    instead = "" if compared else " ".join(_refusal(*one) for one in reasons.items())
     head = (
         "Model-based against data-driven:" if compared else "No data-driven controller; two model-based ones:"
     )
@@ -60,6 +59,11 @@ def pair_sentence(figures: Figures) -> PairSentence:
     interval = _interval(pair, sign=sign) if gain <= 90 else ""
     text = f"{better} costs {amount} than {worse} on the same {plants} plants"
     return PairSentence(f"{head} {text}{_bracket(interval, chance)}.", str(winner), instead)
+
+
+def _refusal(name: str, why: str) -> str:
+    subject = in_a_sentence(name)
+    return f"{subject[:1].upper()}{subject[1:]} is refused: {why.rstrip('.')}."
 
 
 def _interval(pair: Mapping[str, Any], *, sign: int) -> str:

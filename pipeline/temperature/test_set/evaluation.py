@@ -188,13 +188,14 @@ def decide(
     entrants: list[str],
     summary: Mapping[str, Any],
     setting: panel.CaseConditions,
+    tuned: Mapping[str, float],
     seed: int,
 ) -> dict[str, Any]:
-    """The pair, and the plant that decides, with the pair's answer without it."""
+    """The pair, and the plant that decides, with the pair's answer without it. `tuned` are the costs of the
+    searches, by controller."""
     block = setting.rehearsal.judging.plant
     costs = {name: results[name].costs for name in entrants}
-    a, b = table.PAIR
-    b = b if b in costs else table.INDIRECT
+    a, b = table.answering_pair(entrants, tuned)
     one, two = a, b
     if not (a in costs and b in costs):
         one, two = entrants[max(len(entrants) - 2, 0)], entrants[-1]

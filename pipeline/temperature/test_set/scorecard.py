@@ -6,7 +6,7 @@ plant decides; and what a record is enough for. What a controller does as deploy
 Cases of one plant stand or fall together: plants are the blocks of every test and of every band.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -316,35 +316,29 @@ def mean_and_worst(costs: np.ndarray, plant: np.ndarray, *, weight: float) -> fl
 def sufficiency(
     u: Sequence[np.ndarray],
     y: Sequence[np.ndarray],
-    learned: window_route.WindowModel,
+    learn: Callable[[Sequence[np.ndarray], Sequence[np.ndarray]], Law],
     yardstick: CommonCost,
     scenarios: Scenarios,
     *,
+    whole: float,
+    samples: int,
+    least: int,
     allowed: float,
-    offset: bool,
-    gain_spread: float,
 ) -> tuple[float, int]:
     """Whether the record is long enough for its noise, by the record alone: the extra cost of a controller
-    learned from half of it, the mean of both halves, on `scenarios` of the model learned from all of it; and
-    at how many samples it would be the excess `allowed`, as it falls as one over the samples."""
-    best = optimum(scenarios, yardstick)
+    that `learn` makes of half of it, the mean of both halves, on `scenarios` of the model learned from all of
+    its `samples`, where the one of the whole record costs `whole`; and at how many samples it would be the
+    excess `allowed`, as it falls as one over the samples, `least` of them at least."""
     gaps = []
     for part in (0, 1):
         half_u, half_y = (
             [rows[part * len(rows) // 2 : (part + 1) * len(rows) // 2] for rows in signal]
             for signal in (u, y)
         )
-        half = window_route.learn(half_u, half_y, longest=learned.N, offset=offset, gain_spread=gain_spread)
-        law = window_route.law(half, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma)
-        run = simulate(scenarios, law)
-        gaps.append((cost(scenarios, run, yardstick) / best - 1)[0])
+        run = simulate(scenarios, learn(half_u, half_y))
+        gaps.append(cost(scenarios, run, yardstick)[0] / whole - 1)
     half_gap = float(np.mean(gaps))
-    # never fewer than twice the numbers of one output's predictor:
-    # below that the half-record test itself means nothing
-    needed = max(
-        np.ceil(learned.samples * min(half_gap / 2 / allowed, 1e3)), 2 * (learned.Theta.shape[1] + offset)
-    )
-    return half_gap, int(needed)
+    return half_gap, max(int(np.ceil(samples * min(half_gap / 2 / allowed, 1e3))), least)
 
 
 class KernelCandidate(NamedTuple):
