@@ -6,7 +6,7 @@ data."""
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pydantic import Field
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pipeline.temperature.controllers.feed_forward import Told
+    from pipeline.temperature.controllers.kernel import Regression
     from pipeline.temperature.controllers.predictive import Trajectories
     from pipeline.temperature.controllers.window import WindowModel
     from pipeline.temperature.test_set.scorecard import CommonCost, KernelCandidate, Scenarios
@@ -74,79 +75,99 @@ METRICS = (
 )
 
 
+class Learned(NamedTuple):
+    """What one record says, whatever the weights: None, and in `undetermined` why, by controller, if the
+    record does not determine it; and the figures of the stage."""
+
+    window: WindowModel
+    kernel: Regression | None
+    trajectories: Trajectories | None
+    undetermined: dict[str, str]
+    figures: dict[str, Any]
+
+
 def main() -> None:
     with artifacts.stage("learn_kernel") as out:
-        import numpy as np
-
         from pipeline.temperature.controllers import feed_forward, window
         from pipeline.temperature.identification import model_choice
-        from pipeline.temperature.plant import hold_output
-        from pipeline.temperature.test_set import scorecard
-        from pipeline.temperature.test_set.scorecard import CommonCost, Scenarios
 
         settings = params.load(LearnKernel, "learn_kernel")
         machine = recorded(params.load(Plant, "plant"), RECORD)
-        tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
-        simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
-        inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
-        yardstick = CommonCost(
-            np.full(len(outputs), tracking.yardstick_q),
-            np.full(len(inputs), tracking.yardstick_r),
-            tracking.gamma,
-        )
         u, y, told = read_record(machine)
         with artifacts.about(RECORD):
-            model_choice.check_inputs(u, offset=settings.offset, names=inputs)
-            model_choice.check_outputs(y, names=outputs)
-        # candidates are compared on a run from the panel's first training start on the simulated machine, and
-        # from the cold end of what was recorded on another
-        start_degC = (
-            panel.training.starts_degC[0] if simulated else float(np.nanquantile(np.vstack(y), COLD_SHARE))
-        )
-        long = window.learn(
-            u, y, longest=settings.longest_window, offset=settings.offset, gain_spread=settings.gain_spread
-        )
-        model = window.predictor(long)
-        x0, u0 = hold_output(model, np.full(model.p, start_degC))
-        r = np.array([[o.reference for o in machine.outputs]], float)
-        scenarios = Scenarios([model], np.zeros(1, int), x0[None], u0[None], r, panel.steps, hold=0)
-        weights = np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma
-
-        def halved(u: Segments, y: Segments) -> Law:
-            half = window.learn(
-                u, y, longest=long.N, offset=settings.offset, gain_spread=settings.gain_spread
-            )
-            return window.law(half, *weights)
-
-        # never fewer samples than twice the numbers of one output's predictor: below that the half-record
-        # test itself means nothing
-        half_gap, needed = scorecard.sufficiency(
-            u,
-            y,
-            halved,
-            yardstick,
-            scenarios,
-            whole=scorecard.optimum(scenarios, yardstick)[0],
-            samples=long.samples,
-            least=2 * (long.Theta.shape[1] + settings.offset),
-            allowed=settings.allowed_gap_percent / 100,
-        )
-        trajectories, predictive = learn_trajectories(settings, u, y, long, yardstick, scenarios)
-        candidates = scorecard.kernel_candidates(
-            u, y, long, yardstick, scenarios, largest=settings.largest_kernel_window, offset=settings.offset
-        )
-        best = min(candidates, key=lambda candidate: candidate.gap)
-        artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(long))
+            model_choice.check_inputs(u, offset=settings.offset, names=[i.name for i in machine.inputs])
+            model_choice.check_outputs(y, names=[o.name for o in machine.outputs])
+        learned = learn(settings, machine, u, y)
+        artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(learned.window))
         if told is not None:
             artifacts.write_arrays(out / "feed_forward.parquet", "feed_forward", 1, feed_forward.stored(told))
-        if best.learned is not None:
-            artifacts.write_arrays(out / "kernel.parquet", "kernel", 1, best.learned.stored())
-        if trajectories is not None:
-            factors = trajectories.stored()
-            artifacts.write_arrays(out / "trajectories.parquet", "trajectories", 1, factors)
-        shown = figures(settings, long, half_gap, needed, candidates, best, predictive)
-        shown["forward"] = forward_figures(machine, told)
+        for name in ("kernel", "trajectories"):
+            if (part := getattr(learned, name)) is not None:
+                artifacts.write_arrays(out / f"{name}.parquet", name, 1, part.stored())
+        shown = learned.figures | {"forward": forward_figures(machine, told)}
         artifacts.write_metrics("learn_kernel", shown, METRICS)
+
+
+def learn(settings: LearnKernel, machine: Plant, u: Segments, y: Segments) -> Learned:
+    """The window, the kernel and the trajectories of a record, and whether it is long enough for them. Raises
+    ValueError if it is too short for a window."""
+    import numpy as np
+
+    from pipeline.temperature.controllers import window
+    from pipeline.temperature.plant import hold_output
+    from pipeline.temperature.test_set import scorecard
+    from pipeline.temperature.test_set.scorecard import CommonCost, Scenarios
+
+    tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
+    simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
+    yardstick = CommonCost(
+        np.full(len(machine.outputs), tracking.yardstick_q),
+        np.full(len(machine.inputs), tracking.yardstick_r),
+        tracking.gamma,
+    )
+    # candidates are compared on a run from the panel's first training start on the simulated machine, and
+    # from the cold end of what was recorded on another
+    start_degC = (
+        panel.training.starts_degC[0] if simulated else float(np.nanquantile(np.vstack(y), COLD_SHARE))
+    )
+    long = window.learn(
+        u, y, longest=settings.longest_window, offset=settings.offset, gain_spread=settings.gain_spread
+    )
+    model = window.predictor(long)
+    x0, u0 = hold_output(model, np.full(model.p, start_degC))
+    r = np.array([[o.reference for o in machine.outputs]], float)
+    scenarios = Scenarios([model], np.zeros(1, int), x0[None], u0[None], r, panel.steps, hold=0)
+
+    def law_of_half(u: Segments, y: Segments) -> Law:
+        half = window.learn(u, y, longest=long.N, offset=settings.offset, gain_spread=settings.gain_spread)
+        return window.law(half, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma)
+
+    # never fewer samples than twice the numbers of one output's predictor: below that the half-record test
+    # itself means nothing
+    half_gap, needed = scorecard.sufficiency(
+        u,
+        y,
+        law_of_half,
+        yardstick,
+        scenarios,
+        whole=scorecard.optimum(scenarios, yardstick)[0],
+        samples=long.samples,
+        least=2 * (long.Theta.shape[1] + settings.offset),
+        allowed=settings.allowed_gap_percent / 100,
+    )
+    trajectories, predictive = learn_trajectories(settings, u, y, long, yardstick, scenarios)
+    candidates = scorecard.kernel_candidates(
+        u, y, long, yardstick, scenarios, largest=settings.largest_kernel_window, offset=settings.offset
+    )
+    best = min(candidates, key=lambda candidate: candidate.gap)
+    reasons = {
+        "learned_kernel": None if best.learned else best.refusal,
+        "predictive_control": predictive["refused"],
+    }
+    undetermined = {name: reason for name, reason in reasons.items() if reason}
+    shown = figures(settings, long, half_gap, needed, candidates, best)
+    shown |= {"undetermined": undetermined, "predictive": predictive}
+    return Learned(long, best.learned, trajectories, undetermined, shown)
 
 
 def learn_trajectories(
@@ -174,7 +195,7 @@ def learn_trajectories(
         return predictive.law(learned, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma)
 
     try:
-        T = predictive.horizon(long.samples, long.N, m, p, longest=settings.longest_horizon)
+        T = predictive.horizon(long.samples, len(u), long.N, m, p, longest=settings.longest_horizon)
         learned = learn(u, y)
         run = scorecard.simulate(scenarios, law(learned))
         half_excess, needed = scorecard.sufficiency(
@@ -224,13 +245,8 @@ def figures(
     needed: int,
     candidates: list[KernelCandidate],
     best: KernelCandidate,
-    predictive: dict[str, Any],
 ) -> dict[str, Any]:
     kernel = best.learned
-    reasons = {
-        "learned_kernel": None if kernel else best.refusal,
-        "predictive_control": predictive["refused"],
-    }
     return {
         "window": long.N,
         "samples": long.samples,
@@ -239,7 +255,6 @@ def figures(
         "samples_needed_for_noise": needed,
         "state": best.state if kernel else None,
         "refused": None if kernel else best.refusal,
-        "undetermined": {name: reason for name, reason in reasons.items() if reason},
         "rank": kernel.rank if kernel else None,
         "identifiable": kernel.unknowns if kernel else None,
         "samples_needed": kernel.unknowns if kernel else None,
@@ -251,7 +266,6 @@ def figures(
             }
             for c in candidates
         },
-        "predictive": predictive,
     }
 
 

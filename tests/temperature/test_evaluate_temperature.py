@@ -111,7 +111,7 @@ def judged(
         given.weights if weights is None else weights,
         simulated=True,
     )
-    settings = section(EvaluateTemperature, "evaluate_temperature")
+    settings = section(EvaluateTemperature, "evaluate_temperature").model_copy(update={"cost_curve": False})
     return Compared(*evaluate_temperature.compare(settings, loaded, execution))
 
 

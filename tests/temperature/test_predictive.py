@@ -149,7 +149,7 @@ def test_an_output_hangs_on_no_input_that_comes_later():
 def test_a_longer_horizon_comes_nearer_to_the_endless_one_and_holds_the_plant():
     x, u, y = record()
     best, r, gaps = gains(SMALL, Q, R, GAMMA), np.array([2.0, -1.0]), []
-    for horizon in (4, 16, 40):
+    for horizon in (4, 16, 80):
         law = predictive.law(predictive.learn([u], [y], N, horizon), Q, R, GAMMA)
         mine = -law.K @ window_at(u, y, 500) - law.K_r @ r - law.k
         gaps.append(np.abs(mine + best.K_x @ x[500] + best.K_r @ r + best.k).max())
@@ -201,8 +201,19 @@ def test_an_input_that_only_feeds_back_is_refused_by_its_number():
 
 
 def test_the_horizon_is_what_half_of_the_record_carries():
-    assert predictive.horizon(6000, 24, 7, 5, longest=40) == 40
-    assert predictive.horizon(1600, 24, 7, 5, longest=40) == (400 - 289) // 7
-    message = "at least 1296 complete windows of 24 samples for a horizon of 5, found 1200; record 96 more"
+    assert predictive.horizon(6000, 1, 24, 7, 5, longest=40) == 40
+    # half of 1,600 windows, less the window that the cut costs, for twice 1 + 24 x 12 + T x 7 unknowns and T
+    assert predictive.horizon(1600, 1, 24, 7, 5, longest=40) == (800 - 24 - 2 * 289) // 15
+    message = "at least 1354 complete windows of 24 samples for a horizon of 5, found 1200; record 154 more"
     with pytest.raises(ValueError, match=message):
-        predictive.horizon(1200, 24, 7, 5, longest=40)
+        predictive.horizon(1200, 1, 24, 7, 5, longest=40)
+
+
+@pytest.mark.parametrize("samples", [120, 150, 300])
+def test_half_of_every_segment_determines_the_horizon(samples):
+    _, u, y = record(samples)
+    pieces = [np.split(signal, 2) for signal in (u, y)]
+    windows = samples - 2 * N
+    T = predictive.horizon(windows, 2, N, 2, 2, longest=40)
+    halves = [[piece[: len(piece) // 2] for piece in signal] for signal in pieces]
+    assert predictive.learn(*halves, N, T).samples >= predictive.ROWS * (1 + 4 * N + 2 * T)

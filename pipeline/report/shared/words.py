@@ -104,7 +104,7 @@ FIXED = {
     ),
     "columns": (
         "Data\u2011driven, model\u2011based",
-        "Temperature: Algorithm 2’s learned kernel; subspace + LQG, designed from the identified model. "
+        "Temperature: the learned kernel or predictive control; a controller of an identified model. "
         "Deposition: basis functions of a chain identified "
         + "from trials; the paper’s law and its library; on\u2011off control. Setpoint: the paper’s "
         "agent; a Bayes filter.",

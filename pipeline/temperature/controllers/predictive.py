@@ -72,13 +72,14 @@ def restored(arrays: dict[str, Any]) -> Trajectories:
     return Trajectories(**arrays)._replace(N=int(arrays["N"]), samples=int(arrays["samples"]))
 
 
-def horizon(windows: int, N: int, m: int, p: int, *, longest: int) -> int:
-    """The horizon T: `longest`, or the longest that half of a record with so many complete `windows` of N
-    samples determines, so that a half can be compared with the whole. Raises ValueError if that is less than
-    SHORTEST."""
-    T = min(longest, (windows // (2 * ROWS) - 1 - N * (m + p)) // m)
+def horizon(windows: int, segments: int, N: int, m: int, p: int, *, longest: int) -> int:
+    """The horizon T: `longest`, or the longest that half of every segment of a record with so many complete
+    `windows` of N samples determines, so that a half can be compared with the whole. Raises ValueError if
+    that is less than SHORTEST."""
+    least = ROWS * (1 + N * (m + p)) + segments * N
+    T = min(longest, (windows // 2 - least) // (ROWS * m + segments))
     if T < SHORTEST:
-        needed = 2 * ROWS * (1 + N * (m + p) + SHORTEST * m)
+        needed = 2 * (least + SHORTEST * (ROWS * m + segments))
         raise ValueError(
             f"predictive control cannot be learned: expected at least {needed} complete windows of {N} "
             f"samples for a horizon of {SHORTEST}, found {windows}; record {needed - windows} more samples"

@@ -254,22 +254,37 @@ def between(champion: np.ndarray, challenger: np.ndarray, plant: np.ndarray, *, 
     )
 
 
-def pair(a: str, b: str, costs: Mapping[str, np.ndarray], plant: np.ndarray, *, seed: int) -> dict[str, Any]:
-    """Of two contestants a and b the `winner`, the cheaper one beyond chance, None where nobody is; by how
-    many percent of the other's cost the cheaper one is so (`difference`), beyond chance or not, with the ends
-    `low` and `high` of the 90 % interval and the two-sided `p`."""
+def pair(
+    a: str, b: str, costs: Mapping[str, np.ndarray], plant: np.ndarray, structure: np.ndarray, *, seed: int
+) -> dict[str, Any]:
+    """Of two contestants a and b the `winner`, the cheaper one beyond chance and beyond what the structure of
+    a machine changes, None where nobody is; by how many percent of the other's cost the cheaper one is so
+    (`difference`), with the ends `low` and `high` of the 90 % interval, the two-sided `p`, and
+    `by_structure` the same difference on the plants of each structure (s,).
+
+    `kept`: the difference is larger than the range of those. The range of five is some 2.33 deviations, and
+    half of the 90 % interval for one more is 2.34: another structure would then keep the sign.
+    """
     forward = between(costs[b], costs[a], plant, seed=seed)
     backward = between(costs[a], costs[b], plant, seed=seed)
     cheaper, result = (a, forward) if forward.improvement_percent >= 0 else (b, backward)
-    p = min(1.0, 2 * result.p)
+    p, dearer = min(1.0, 2 * result.p), b if cheaper == a else a
+    own = [structure == kind for kind in np.unique(structure)]
+    by_structure = [
+        between(costs[dearer][rows], costs[cheaper][rows], plant[rows], seed=seed).improvement_percent
+        for rows in own
+    ]
+    kept = result.improvement_percent > np.ptp(by_structure)
     return {
         "a": a,
         "b": b,
-        "winner": cheaper if p < LEVEL else None,
+        "winner": cheaper if p < LEVEL and kept else None,
         "difference": result.improvement_percent,
         "low": result.low_percent,
         "high": result.high_percent,
         "p": p,
+        "by_structure": by_structure,
+        "kept": bool(kept),
     }
 
 
