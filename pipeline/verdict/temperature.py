@@ -52,8 +52,8 @@ def refused(figures: Figures) -> dict[str, str]:
         entry(figures.get("learn_kernel"), "undetermined"),
     )
     standing = entry(comparison(figures), "contestants") or {}
-    reasons = {**(judged or {}), **(learned or {})}
-    return {name: str(why) for name, why in reasons.items() if name not in standing}
+    undetermined = {name: why for name, why in (learned or {}).items() if name not in standing}
+    return {name: str(why) for name, why in {**(judged or {}), **undetermined}.items()}
 
 
 def finite(value: Any) -> float:

@@ -209,7 +209,7 @@ def test_the_horizon_is_what_half_of_the_record_carries():
         predictive.horizon(1200, 1, 24, 7, 5, longest=40)
 
 
-@pytest.mark.parametrize("samples", [120, 150, 300])
+@pytest.mark.parametrize("samples", [140, 180, 300])
 def test_half_of_every_segment_determines_the_horizon(samples):
     _, u, y = record(samples)
     pieces = [np.split(signal, 2) for signal in (u, y)]
