@@ -340,14 +340,6 @@ def test_where_the_record_determines_no_data_driven_controller_the_pair_is_of_tw
     assert (summary["pair"]["a"], summary["pair"]["b"]) == ("subspace_lqg", "varx_riccati")
 
 
-def test_predictive_control_answers_for_its_kind_where_the_kernel_cannot(given):
-    weights = {name: values for name, values in given.weights.items() if name != "learned_kernel"}
-    problem = given.problem._replace(kernel=None)
-    summary = judged(given._replace(problem=problem), weights).summary
-    assert (summary["pair"]["a"], summary["pair"]["b"]) == ("subspace_lqg", "predictive_control")
-    assert summary["pair"]["difference"] is not None
-
-
 def test_one_whose_search_never_worked_is_refused_and_the_others_go_on(given):
     weights = {name: values for name, values in given.weights.items() if name != "varx_riccati"}
     summary = judged(given, weights).summary
