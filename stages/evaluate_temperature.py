@@ -72,9 +72,6 @@ def read_weights(path: str | Path) -> Weights:
         raise ValueError(f"{path}: {place}: {first['msg']}; {artifacts.remedy(path)}") from None
 
 
-LEARNED = ("window", "kernel", "trajectories", "undetermined")  # of a design problem, from the record itself
-
-
 def wire(declared: Plant) -> Machine:
     """Section `plant` as a controller knows it."""
     from pipeline.deploy.supervise import Machine, Signal
@@ -259,7 +256,9 @@ def learn_from(
         found = model_choice.identify(u, y, sample_time_s=machine.sample_time_s, settings=rules)
         return loaded.problem._replace(plant=strictly_proper(observable_part(found.plant)))
     learned = learn(params.load(LearnKernel, "learn_kernel"), machine, u, y)
-    return loaded.problem._replace(**{name: getattr(learned, name) for name in LEARNED})
+    return loaded.problem._replace(
+        **{key: part for key, part in learned._asdict().items() if key != "figures"}
+    )
 
 
 def conditions(machine: Plant, panel: Panel, setting: CaseConditions) -> dict[str, Any]:

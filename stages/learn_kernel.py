@@ -75,7 +75,7 @@ METRICS = (
 )
 
 
-class Learned(NamedTuple):
+class LearnedFromRecord(NamedTuple):
     """What one record says, whatever the weights: None, and in `undetermined` why, by controller, if the
     record does not determine it; and the figures of the stage."""
 
@@ -108,7 +108,7 @@ def main() -> None:
         artifacts.write_metrics("learn_kernel", shown, METRICS)
 
 
-def learn(settings: LearnKernel, machine: Plant, u: Segments, y: Segments) -> Learned:
+def learn(settings: LearnKernel, machine: Plant, u: Segments, y: Segments) -> LearnedFromRecord:
     """The window, the kernel and the trajectories of a record, and whether it is long enough for them. Raises
     ValueError if it is too short for a window."""
     import numpy as np
@@ -167,7 +167,7 @@ def learn(settings: LearnKernel, machine: Plant, u: Segments, y: Segments) -> Le
     undetermined = {name: reason for name, reason in reasons.items() if reason}
     shown = figures(settings, long, half_gap, needed, candidates, best)
     shown |= {"undetermined": undetermined, "predictive": predictive}
-    return Learned(long, best.learned, trajectories, undetermined, shown)
+    return LearnedFromRecord(long, best.learned, trajectories, undetermined, shown)
 
 
 def learn_trajectories(

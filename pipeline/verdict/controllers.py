@@ -5,7 +5,6 @@ from pipeline.temperature.controllers.table import BY_NAME, CONTROLLERS
 
 # shown beside the others, never the best of them
 YARDSTICKS = tuple(controller.name for controller in CONTROLLERS if controller.kind == "reference")
-KERNEL = "learned_kernel"
 
 
 def heading(name: str) -> str:
@@ -21,5 +20,5 @@ def in_a_sentence(name: str) -> str:
     text = BY_NAME[name].word if name == "printer_pid" else heading(name)
     if text.startswith(("PI", "VARX")):
         return text
-    article = "the " if name in (KERNEL, *YARDSTICKS) else ""
+    article = "the " if name in ("learned_kernel", *YARDSTICKS) else ""
     return f"{article}{text[:1].lower()}{text[1:]}"

@@ -49,15 +49,14 @@ def pair_sentence(figures: Figures) -> PairSentence:
     if winner not in (a, b):
         # a 90 % interval may leave out zero where p is between 0.05 and 0.1: the level is said
         saved = abs(finite(entry(pair, "difference")))
-        interval = _interval(pair, sign=1) if saved <= 90 else ""
+        interval = _interval(pair) if saved <= 90 else ""
         saves = f"the cheaper one saves {number(saved, 1)} %" if interval else ""
         level = "at the 5 % level" if entry(pair, "kept") else "that another machine would keep"
         text = f"no difference {level} between {better} and {worse} on the same {plants} plants"
         return PairSentence(f"{head} {text}{_bracket(saves, interval, by_structure)}.", None, instead)
-    sign = 1 if finite(entry(pair, "difference")) >= 0 else -1
     gain = abs(finite(entry(pair, "difference")))
     amount = "far less" if not gain <= 90 else f"{number(gain, 0 if gain >= 10 else 1)} % less"
-    interval = _interval(pair, sign=sign) if gain <= 90 else ""
+    interval = _interval(pair) if gain <= 90 else ""
     text = f"{better} costs {amount} than {worse} on the same {plants} plants"
     return PairSentence(f"{head} {text}{_bracket(interval, by_structure)}.", str(winner), instead)
 
@@ -104,8 +103,8 @@ def _refusal(name: str, why: str) -> str:
     return f"{subject[:1].upper()}{subject[1:]} is refused: {why.rstrip('.')}."
 
 
-def _interval(pair: Mapping[str, Any], *, sign: int) -> str:
-    ends = sorted(sign * finite(entry(pair, end)) for end in ("low", "high"))
+def _interval(pair: Mapping[str, Any]) -> str:
+    ends = sorted(finite(entry(pair, end)) for end in ("low", "high"))
     if not all(abs(end) <= 1000 for end in ends):
         return ""
     places = 0 if max(map(abs, ends)) >= 20 else 1

@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.temperature.controllers import predictive
-from pipeline.temperature.controllers.law import compact
 from pipeline.temperature.plant import plant, simulate
-from pipeline.temperature.test_set.scorecard import closed_loop
-from pipeline.temperature.tracking import gains
 
 SMALL = plant(
     [[0.8, 0.2, 0.0], [-0.1, 0.7, 0.3], [0.0, 0.1, 0.9]],
@@ -84,16 +81,15 @@ def test_blocks_of_rows_give_the_factors_of_all_rows_at_once(monkeypatch, noise)
 
 
 def test_memory_does_not_grow_with_the_record():
-    def peak(samples):
+    peaks = []
+    for samples in (10_000, 30_000):
         _, u, y = record(samples)
         tracemalloc.start()
         predictive.learn([u], [y], N, T)
-        most = tracemalloc.get_traced_memory()[1]
+        peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-        return most
-
-    hankel = 8 * 30_000 * (N + T) * 4
-    assert peak(30_000) - peak(10_000) < hankel / 5
+    # less than a fifth of what the Hankel matrix of 30,000 samples would take
+    assert peaks[1] - peaks[0] < 8 * 30_000 * (N + T) * 4 / 5
 
 
 # ---- the law
@@ -136,17 +132,6 @@ def test_with_gamma_3_zero_it_is_the_least_squares_predictor_of_each_step():
         regressors = np.hstack([z, coming_u[:, : 2 * (k + 1)]])
         theirs = regressors @ np.linalg.lstsq(regressors, coming_y[:, 2 * k : 2 * k + 2], rcond=None)[0]
         np.testing.assert_allclose(ours[:, 2 * k : 2 * k + 2], theirs, atol=1e-9)
-
-
-def test_a_longer_horizon_comes_nearer_to_the_endless_one_and_holds_the_plant():
-    x, u, y = record()
-    best, r, gaps = gains(SMALL, Q, R, GAMMA), np.array([2.0, -1.0]), []
-    for horizon in (4, 16, 80):
-        law = predictive.law(predictive.learn([u], [y], N, horizon), Q, R, GAMMA)
-        mine = -law.K @ window_at(u, y, 500) - law.K_r @ r - law.k
-        gaps.append(np.abs(mine + best.K_x @ x[500] + best.K_r @ r + best.k).max())
-    assert gaps[0] > gaps[1] > gaps[2] < 1e-3
-    assert np.abs(np.linalg.eigvals(closed_loop(SMALL, compact(law, N)))).max() < 1
 
 
 def test_a_spread_of_gains_is_the_mean_over_records_with_other_gains():

@@ -22,7 +22,7 @@ Automatica 152 (2023), (14)-(19); the zeros of L32 are those of Sader et al., "C
 predictive control", arXiv 2311.09545 (2023).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -112,10 +112,9 @@ def learn(
     gain_spread: float = 0.0,
     tolerance: float = 1e-9,
 ) -> Trajectories:
-    """The factors from segments u (samples, m), y (samples, p), in blocks of rows: memory grows with the
-    window N and the horizon T, not with the record. Directions of z below `tolerance` of the largest hold
-    nothing but rounding. Raises ValueError if there are fewer rows than twice the unknowns of an output, or
-    if an input follows from the past."""
+    """The factors from segments u (samples, m), y (samples, p), in blocks of rows: memory grows with N and T,
+    not with the record. Directions of z below `tolerance` of the largest are rounding. Raises ValueError if
+    there are fewer rows than ROWS times the unknowns of an output, or if an input follows from the past."""
     m, p = u[0].shape[1], y[0].shape[1]
     k, of_u = 1 + N * (m + p), T * m
     signals = np.hstack([np.vstack(u), np.vstack(y)])
@@ -125,11 +124,7 @@ def learn(
     # z is counted from the mean, so that its constant stands apart
     mean = np.where(np.arange(len(of_column)) < k - 1, np.nanmean(signals, axis=0)[of_column], 0.0)
     scale = np.maximum(np.nanstd(signals, axis=0), TINY)[of_column]
-    triangle, samples = np.zeros((0, k + T * (m + p))), 0
-    for rows in hankel_rows(u, y, N, T):
-        columns = np.hstack([np.ones((len(rows), 1)), (rows - mean) / scale])
-        triangle = np.asarray(np.linalg.qr(np.vstack([triangle, columns]), mode="r"))
-        samples += len(rows)
+    triangle, samples = _triangle(hankel_rows(u, y, N, T), mean, scale)
     if samples < ROWS * (k + of_u):
         raise ValueError(
             f"predictive control cannot be learned: expected at least {ROWS * (k + of_u)} stretches of "
@@ -168,6 +163,17 @@ def learn(
         N,
         samples,
     )
+
+
+def _triangle(blocks: Iterable[np.ndarray], mean: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, int]:
+    """R of the QR factorisation of [1, (rows - mean) / scale], a block of rows after the other, and how many
+    rows there are."""
+    triangle, samples = np.zeros((0, 1 + len(mean))), 0
+    for rows in blocks:
+        columns = np.hstack([np.ones((len(rows), 1)), (rows - mean) / scale])
+        triangle = np.asarray(np.linalg.qr(np.vstack([triangle, columns]), mode="r"))
+        samples += len(rows)
+    return triangle, samples
 
 
 def _alone(triangle: np.ndarray, mine: np.ndarray) -> np.ndarray:
