@@ -4,6 +4,7 @@ trajectories.parquet, and its figures as figures.json and summary.json."""
 
 from __future__ import annotations
 
+import functools
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -15,9 +16,13 @@ from pipeline.store import artifacts, params
 from pipeline.store.params import Execution, Section
 from pipeline.temperature import tables
 from pipeline.temperature.settings import Panel, Plant, Tracking, TuneWeights, recorded
+from stages.identify_plant import IdentifyPlant, choices
+from stages.learn_kernel import LearnKernel, learn, read_record
 from stages.tune_weights import load_design_problem
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from pipeline.deploy.supervise import Machine
     from pipeline.temperature.controllers.problem import Design, DesignProblem
     from pipeline.temperature.test_set.evaluation import ControllerOutcome
@@ -25,11 +30,12 @@ if TYPE_CHECKING:
 
 
 class EvaluateTemperature(Section):
-    """Section `evaluate_temperature`: the seed of its tests, and how often the plants are resampled for a
-    band."""
+    """Section `evaluate_temperature`: the seed of its tests, how often the plants are resampled for a band,
+    and whether controllers are learned again from less of the record."""
 
     seed: int = Field(ge=0, le=2**31)
     resamples: int = Field(ge=20, le=100_000)
+    cost_curve: bool
 
 
 Positive = Annotated[float, Field(gt=0)]
@@ -123,7 +129,7 @@ def compare(
 
     machine, setting = loaded.machine, loaded.setting
     outcomes, supervised, refused = evaluate_all(loaded, execution)
-    entrants = [name for name in outcomes if BY_NAME[name].role != "yardstick"]
+    entrants = [name for name in outcomes if BY_NAME[name].kind != "reference"]
     summary: dict[str, Any] = {
         **conditions(machine, loaded.panel, setting),
         "contestants": {
@@ -140,8 +146,11 @@ def compare(
         "order": entrants,
         "refused": refused,
     }
-    summary |= evaluation.decide(outcomes, entrants, summary, setting, settings.seed)
+    tuned = {name: values.get("cost", math.inf) for name, values in loaded.weights.items()}
+    summary |= evaluation.decide(outcomes, entrants, summary, setting, tuned, settings.seed)
     summary["redesigned"] = redesigns(entrants, loaded)
+    pair = summary["pair"]["a"], summary["pair"]["b"]
+    summary["cost_curve"] = cost_curve(loaded, pair, settings.seed) if settings.cost_curve else None
     typical = evaluation.typical_case(outcomes, entrants)
     drawn = {"typical": typical, "deciding": summary["deciding"]["case"]}
     return (
@@ -202,6 +211,54 @@ def redesigns(names: list[str], loaded: EvaluationInputs) -> dict[str, dict[str,
         percent = 100.0 * excess if excess < float("inf") else None
         found[name] = {"excess_percent": percent, "broken": broken, "of": of}
     return found
+
+
+def cost_curve(loaded: EvaluationInputs, pair: tuple[str, str], seed: int) -> dict[str, Any]:
+    """Cost against the length of the record, of every model-based and data-driven controller that was tuned;
+    `refused` says by length and controller why one could not be learned."""
+    from pipeline.temperature.controllers.table import CONTROLLERS
+    from pipeline.temperature.test_set import record_length
+
+    u, y, _ = read_record(loaded.machine)
+    setting = record_length.few_plants(loaded.setting)
+    kinds = ("model-based", "data-driven")
+    asked = [one for one in CONTROLLERS if one.kind in kinds and one.name in loaded.weights]
+    samples, costs, refused = [], [], {}
+    for share in record_length.SHARES:
+        part = [record_length.beginning(signal, share) for signal in (u, y)]
+        learn_once = functools.cache(functools.partial(learn_from, loaded, *part))
+        samples.append(sum(map(len, part[0])))
+        costs.append({})
+        for one in asked:
+            try:
+                problem = loaded.problem if share == 1 else learn_once(one.learned_from == "plant")
+                design = one.design(problem, loaded.weights[one.name])
+            except ValueError as reason:
+                refused.setdefault(str(samples[-1]), {})[one.name] = str(reason)
+            else:
+                if design is not None:
+                    costs[-1][one.name] = record_length.plant_costs(design, setting)
+    return record_length.curves(costs, samples, pair, seed=seed) | {"refused": refused}
+
+
+def learn_from(
+    loaded: EvaluationInputs, u: list[np.ndarray], y: list[np.ndarray], of_plant: bool
+) -> DesignProblem:
+    """What a controller is designed from, its plant or what is learned from the record itself, again from
+    segments u (T, m), y (T, p) as identify_plant and learn_kernel have it. Raises ValueError if they are too
+    short."""
+    from pipeline.temperature.identification import model_choice
+    from pipeline.temperature.plant import observable_part, strictly_proper
+
+    machine = loaded.machine
+    if of_plant:
+        rules = choices(params.load(IdentifyPlant, "identify_plant"), len(machine.inputs), range(len(u)))
+        found = model_choice.identify(u, y, sample_time_s=machine.sample_time_s, settings=rules)
+        return loaded.problem._replace(plant=strictly_proper(observable_part(found.plant)))
+    learned = learn(params.load(LearnKernel, "learn_kernel"), machine, u, y)
+    return loaded.problem._replace(
+        **{key: part for key, part in learned._asdict().items() if key != "figures"}
+    )
 
 
 def conditions(machine: Plant, panel: Panel, setting: CaseConditions) -> dict[str, Any]:

@@ -7,6 +7,7 @@ handed on is fitted to both parts. A family of plants around it shows its error.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pydantic import Field
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pipeline.store.tables import Schema
-    from pipeline.temperature.identification.model_choice import Identified
+    from pipeline.temperature.identification.model_choice import Identified, Settings
     from pipeline.temperature.identification.validation import Holdout, RecordExcitation, Residuals, Steps
     from pipeline.temperature.plant import Plant
 
@@ -98,18 +99,10 @@ def identify(
     acting, inputs = [signal.name for signal in machine.acting], len(machine.inputs)
     record = read_record(settings, machine, path)
     first, last = split(record.u, record.y, settings.holdout_share)
-    choices = model_choice.Settings(
-        order=settings.order or None,
-        feedthrough=None if settings.feedthrough == "chosen" else False,
-        offset=settings.offset,
-        refinement=settings.refinement,
-        max_order=settings.max_order,
-        recordings=record.recordings,
-        inputs=inputs,
-    )
+    rules = choices(settings, inputs, record.recordings)
     with artifacts.about(path):
         chosen = model_choice.identify(
-            *first, sample_time_s=machine.sample_time_s, settings=choices, names=acting
+            *first, sample_time_s=machine.sample_time_s, settings=rules, names=acting
         )
     rng = np.random.default_rng(settings.seed)
     judgement = judge(chosen, first, last, ahead_steps=settings.ahead_steps, rng=rng)
@@ -138,6 +131,21 @@ def identify(
     figures = fit_figures(settings, machine, record, fitted, sum(map(len, last[0])), judgement)
     figures["bandwidth_rad_s"] = bandwidth_rad_s(plant)
     return plant, spread, page_tables, figures | warnings(machine, fitted, steps)
+
+
+def choices(settings: IdentifyPlant, inputs: int, recordings: Sequence[int]) -> Settings:
+    """What the identification is free to choose on segments of these `recordings`."""
+    from pipeline.temperature.identification import model_choice
+
+    return model_choice.Settings(
+        order=settings.order or None,
+        feedthrough=None if settings.feedthrough == "chosen" else False,
+        offset=settings.offset,
+        refinement=settings.refinement,
+        max_order=settings.max_order,
+        recordings=tuple(recordings),
+        inputs=inputs,
+    )
 
 
 def read_record(settings: IdentifyPlant, machine: Machine, path: str) -> RecordSegments:

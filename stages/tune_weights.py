@@ -32,10 +32,11 @@ def read_models(
     printer_pid_path: str | Path | None,
     machine: Plant,
 ) -> dict[str, Any]:
-    """The plant, its family, window, kernel and PIDs of a printer that controllers are designed from.
-    `learned_folder` has a kernel only if the record determines one; without a path there is no spread, or no
-    PID. Raises ValueError for a file of another machine than `machine`, as an earlier run leaves it."""
-    from pipeline.temperature.controllers import kernel, window
+    """The plant, its family, what was learned and PIDs of a printer that controllers are designed from.
+    `learned_folder` has kernel and trajectories only if the record determines them, and otherwise says why;
+    without a path there is no spread, or no PID. Raises ValueError for a file of another machine than
+    `machine`, as an earlier run leaves it."""
+    from pipeline.temperature.controllers import kernel, predictive, window
     from pipeline.temperature.plant import restored, strictly_proper
 
     m, p = len(machine.inputs), len(machine.outputs)
@@ -45,15 +46,22 @@ def read_models(
     long = artifacts.read_arrays(
         learned / "window.parquet", "window", 1, shapes={"Theta": (p, None), "covariance": (p, p)}
     )
-    has_kernel = artifacts.exists(learned / "kernel.parquet")
+    direct = {
+        name: restore(artifacts.read_arrays(learned / f"{name}.parquet", name, 1))
+        for name, restore in (("kernel", kernel.restored), ("trajectories", predictive.restored))
+        if artifacts.exists(learned / f"{name}.parquet")
+    }
+    figures = learned / "figures.json"
     family = [strictly_proper(one) for one in (restored(model)[0], *spread)]
     return {
         "plant": family[0],
         "family": family,
         "window": window.restored(long),
-        "kernel": kernel.restored(artifacts.read_arrays(learned / "kernel.parquet", "kernel", 1))
-        if has_kernel
-        else None,
+        "kernel": direct.get("kernel"),
+        "trajectories": direct.get("trajectories"),
+        "undetermined": artifacts.read_json(figures).get("undetermined", {})
+        if artifacts.exists(figures)
+        else {},
         "printer_pid": heater_pids(artifacts.read_json(printer_pid_path), machine)
         if printer_pid_path
         else (),

@@ -156,6 +156,7 @@ DESIGNED_FROM = {
     "pi_simc": "identify_plant/spread.parquet",
     "pi": "identify_plant/spread.parquet",
     "learned_kernel": "learn_kernel/kernel.parquet",
+    "predictive_control": "learn_kernel/trajectories.parquet",
 }
 
 
@@ -327,7 +328,7 @@ def identified(folder: Path) -> plant.Plant:
 
 def _predictor(folder: Path, name: str, machine: Machine) -> plant.Plant:
     """The model that a contestant predicts with: the window where it was learned from one."""
-    if table.BY_NAME[name].learned_from not in ("window", "kernel"):
+    if table.BY_NAME[name].learned_from not in ("window", "kernel", "trajectories"):
         return identified(folder)
     long = window.restored(artifacts.read_arrays(folder / "learn_kernel/window.parquet", "window", 1))
     return window.predictor(long, machine.sample_time_s)

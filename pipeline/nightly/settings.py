@@ -62,7 +62,14 @@ class HoldOut(Section):
     `page`: the contestant that the page names."""
 
     controller: Literal[
-        "page", "printer_pid", "pi_simc", "pi", "subspace_lqg", "varx_riccati", "learned_kernel"
+        "page",
+        "printer_pid",
+        "pi_simc",
+        "pi",
+        "subspace_lqg",
+        "varx_riccati",
+        "learned_kernel",
+        "predictive_control",
     ]
     recordings: Path
     starts_degC: list[Annotated[float, Field(ge=-273.15, le=1000)]] = Field(min_length=1, max_length=20)

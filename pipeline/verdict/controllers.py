@@ -4,15 +4,7 @@ that the table does not know goes by its own name."""
 from pipeline.temperature.controllers.table import BY_NAME, CONTROLLERS
 
 # shown beside the others, never the best of them
-YARDSTICKS = tuple(controller.name for controller in CONTROLLERS if controller.role == "yardstick")
-
-
-def _by_role(role: str) -> str:
-    return next(controller.name for controller in CONTROLLERS if controller.role == role)
-
-
-# the pair that answers "model-based or data-driven?"; if the kernel is refused, a second model-based one
-MODEL_BASED, DATA_DRIVEN, INDIRECT = (_by_role(role) for role in ("model_based", "data_driven", "indirect"))
+YARDSTICKS = tuple(controller.name for controller in CONTROLLERS if controller.kind == "reference")
 
 
 def heading(name: str) -> str:
@@ -28,5 +20,5 @@ def in_a_sentence(name: str) -> str:
     text = BY_NAME[name].word if name == "printer_pid" else heading(name)
     if text.startswith(("PI", "VARX")):
         return text
-    article = "the " if name in (DATA_DRIVEN, *YARDSTICKS) else ""
+    article = "the " if name in ("learned_kernel", *YARDSTICKS) else ""
     return f"{article}{text[:1].lower()}{text[1:]}"

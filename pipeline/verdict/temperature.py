@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.verdict.controllers import BY_NAME, DATA_DRIVEN, YARDSTICKS, heading
+from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading
 from pipeline.verdict.digits import number
 from pipeline.verdict.evidence import Figures, entry
 from pipeline.verdict.rules import at_path, rows
@@ -47,11 +47,13 @@ def names(figures: Figures) -> list[str]:
 
 def refused(figures: Figures) -> dict[str, str]:
     """Why controllers could not take part, by name."""
-    reasons = {name: str(why) for name, why in (entry(comparison(figures), "refused") or {}).items()}
-    kernel = entry(figures.get("learn_kernel"), "refused")
-    if kernel and DATA_DRIVEN not in (entry(comparison(figures), "contestants") or {}):
-        reasons.setdefault(DATA_DRIVEN, str(kernel))
-    return reasons
+    judged, learned = (
+        entry(comparison(figures), "refused"),
+        entry(figures.get("learn_kernel"), "undetermined"),
+    )
+    standing = entry(comparison(figures), "contestants") or {}
+    undetermined = {name: why for name, why in (learned or {}).items() if name not in standing}
+    return {name: str(why) for name, why in {**(judged or {}), **undetermined}.items()}
 
 
 def finite(value: Any) -> float:
@@ -171,6 +173,11 @@ def data(figures: Figures, name: str) -> Figure | Missing:
         gap = entry(learned, "candidates", entry(learned, "state") or "", "gap_on_window_model_percent")
         needed = [entry(learned, "samples_needed"), _for_gap(entry(learned, "samples"), gap, allowed)]
         return _of(learned, entry(learned, "samples"), max((n for n in needed if n), default=None))
+    if learned_from == "trajectories":
+        if reason := entry(learned, "predictive", "refused"):
+            return Missing("failed", str(reason))
+        own = entry(learned, "predictive")
+        return _of(learned, entry(own, "samples"), entry(own, "samples_needed"))
     if learned_from == "window":
         return _of(learned, entry(learned, "samples"), entry(learned, "samples_needed_for_noise"))
     if learned_from == "plant":

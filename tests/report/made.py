@@ -14,7 +14,16 @@ from pipeline.temperature.settings import Plant
 from tests.report import made_certificate, made_setpoint
 
 ROOT = Path(__file__).resolve().parents[2]
-CONTESTANTS = ("hold", "pi_simc", "pi", "subspace_lqg", "varx_riccati", "learned_kernel", "exact_model")
+CONTESTANTS = (
+    "hold",
+    "pi_simc",
+    "pi",
+    "subspace_lqg",
+    "varx_riccati",
+    "learned_kernel",
+    "predictive_control",
+    "exact_model",
+)
 PLANTS, CASES = 6, 24
 HOSTILE = '"><script>alert(1)</script><img src=http://evil.example/x onerror=alert(2)>\u202egpj.mcap'
 PRINTER_PID = {
@@ -134,8 +143,25 @@ def comparison():
             "difference": 6.2,
             "low": 3.1,
             "high": 9.4,
+            "by_structure": [4.0, 6.0, 8.0],
+            "kept": True,
             "plants": PLANTS,
             "figures": {"settling": [6.0, 6.0], "overshoot": [0.5, 0.5], "settled_error": [0.1, 0.1]},
+        },
+        "cost_curve": {
+            "samples": [60, 240, 480],
+            "plants": PLANTS,
+            "pair": ["subspace_lqg", "learned_kernel"],
+            "controllers": {
+                "subspace_lqg": {"cost": [2.4, 2.1, 2.0], "low": [2.2, 1.9, 1.8], "high": [2.6, 2.3, 2.2]},
+                "learned_kernel": {
+                    "cost": [None, 2.0, 2.2],
+                    "low": [None, 1.8, 2.0],
+                    "high": [None, 2.2, 2.4],
+                },
+            },
+            "crossing": {"samples": 300.0, "low": 270.0, "high": 420.0, "share": 1.0},
+            "refused": {"60": {"learned_kernel": "record longer"}},
         },
         "deciding": {
             "plant": 3,
@@ -229,6 +255,8 @@ def metrics():
             "samples_needed": 15,
             "condition": 1e3,
             "candidates": {},
+            "undetermined": {},
+            "predictive": {"refused": None, "horizon": 40, "samples": 336, "samples_needed": 120},
         },
         "tune_weights": {"evaluations": 60},
         "evaluate_temperature": comparison(),

@@ -160,12 +160,13 @@ def test_with_nothing_at_all_the_pages_are_there_and_every_place_says_not_measur
     assert Page(TEMPERATURE).text.lower().count("not measured") > 10
 
 
-def test_a_kernel_that_was_refused_is_shown_as_failed_with_its_sentence(project):
-    change(
-        "learn_kernel", refused="the record does not determine the kernel; record longer", samples_needed=None
-    )
+def test_data_driven_controllers_that_were_refused_are_shown_as_failed_with_their_sentences(project):
+    why = "the record does not determine the kernel; record longer"
+    change("learn_kernel", refused=why, samples_needed=None)
     compared = artifacts.read_figures("evaluate_temperature")
-    del compared["contestants"]["learned_kernel"]
+    compared["refused"] = {"learned_kernel": why, "predictive_control": "too few stretches; record longer"}
+    for name in compared["refused"]:
+        del compared["contestants"][name]
     compared["pair"] = compared["pair"] | {"b": "varx_riccati"}
     artifacts.write_metrics("evaluate_temperature", compared)
     main()
@@ -175,6 +176,7 @@ def test_a_kernel_that_was_refused_is_shown_as_failed_with_its_sentence(project)
             path
         )
     assert "earned kernel is refused: the record does not determine the kernel; record longer." in text
+    assert "redictive control is refused: too few stretches; record longer." in text
     # learning again from the same record would refuse again: no page advises it
     for path in PAGES:
         assert "dvc repro learn_kernel" not in Page(path).text, path

@@ -18,7 +18,7 @@ from pipeline.verdict.decide import decide, questions, standings
 from pipeline.verdict.deposition import verdict as deposition
 from pipeline.verdict.evidence import Evidence
 from pipeline.verdict.identification import trust
-from pipeline.verdict.pairs import pair_sentence
+from pipeline.verdict.pairs import curve_sentence, pair_sentence
 from pipeline.verdict.setpoint import verdict as setpoint
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import (
@@ -303,7 +303,7 @@ def test_the_pair_is_decided_in_a_sentence_of_its_own():
     assert pair_sentence(stages).text == (
         "Model-based against data-driven: subspace + LQG costs 6.2 % less than the learned kernel on "
         "the same "
-        "6 plants (90 % interval 3.1–9.4 %, p = 0.01)."
+        "6 plants (90 % interval 3.1–9.4 %, by structure of the machine 4.0–8.0 %)."
     )
     pair |= {"winner": "learned_kernel", "difference": 6.2, "low": 3.1, "high": 9.4}
     assert "the learned kernel costs 6.2 % less than subspace + LQG" in pair_sentence(stages).text
@@ -312,6 +312,32 @@ def test_the_pair_is_decided_in_a_sentence_of_its_own():
     assert "no difference at the 5 % level between subspace + LQG and the learned kernel" in (
         pair_sentence(stages).text
     )
+    pair |= {"kept": False, "difference": 2.1, "low": 1.0, "high": 3.2, "by_structure": [-3.0, 2.0, 6.0]}
+    assert pair_sentence(stages).text == (
+        "Model-based against data-driven: no difference that another machine would keep between subspace + "
+        "LQG and the learned kernel on the same 6 plants (the cheaper one saves 2.1 %, 90 % interval 1.0–3.2 "
+        "%, by structure of the machine −3.0 to 6.0 %)."
+    )
+
+
+def test_the_length_at_which_the_pair_changes_places_is_said_and_nothing_beyond_the_record():
+    stages = metrics()
+    curve = stages["evaluate_temperature"]["cost_curve"]
+    assert curve_sentence(stages) == (
+        "The pair changes places at 5 min (90 % interval 4–7 min): from there on subspace + LQG costs less."
+    )
+    curve["crossing"] |= {"low": None, "high": None}
+    assert "(its 90 % interval ends not within this record)" in curve_sentence(stages)
+    curve["controllers"]["learned_kernel"]["cost"] = [2.9, 2.8, 2.2]
+    curve["crossing"]["samples"] = None
+    assert curve_sentence(stages) == (
+        "Subspace + LQG costs less at every length from 1 to 8 min. The pair does not change places within "
+        "this record."
+    )
+    curve["controllers"]["learned_kernel"]["cost"] = [None, None, 2.2]
+    assert curve_sentence(stages) == "One of the pair could not be learned from less than this record."
+    stages["evaluate_temperature"]["cost_curve"] = None
+    assert curve_sentence(stages) == ""
 
 
 def test_the_deciding_case_is_told_and_the_verdict_without_it():

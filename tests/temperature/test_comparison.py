@@ -15,6 +15,7 @@ from pipeline.temperature.test_set.scorecard import (
 
 PLANTS, EACH = 30, 4
 PLANT = np.repeat(np.arange(PLANTS), EACH)
+ALIKE = 0 * PLANT  # all plants of one structure
 
 
 def costs(seed: int, *, times: float = 1.0, plants: int = PLANTS, each: int = EACH, own: float = 0.1):
@@ -93,7 +94,9 @@ def test_of_two_alike_the_more_complex_is_best_in_one_of_twenty_panels():
 
 def test_the_pair_has_the_same_winner_whoever_is_named_first():
     both = {"model": costs(1), "data": costs(2, times=0.9)}
-    one, other = pair("model", "data", both, PLANT, seed=1), pair("data", "model", both, PLANT, seed=1)
+    one, other = (
+        pair(*names, both, PLANT, ALIKE, seed=1) for names in (("model", "data"), ("data", "model"))
+    )
     assert one["winner"] == other["winner"] == "data"
     assert list(one.values())[3:] == list(other.values())[3:]
     # by the logarithms of the costs, plant by plant
@@ -103,14 +106,29 @@ def test_the_pair_has_the_same_winner_whoever_is_named_first():
 
 
 def test_a_pair_within_chance_has_a_difference_and_no_winner():
-    result = pair("a", "b", {"a": costs(1), "b": costs(2)}, PLANT, seed=1)
+    result = pair("a", "b", {"a": costs(1), "b": costs(2)}, PLANT, ALIKE, seed=1)
     assert result["winner"] is None and result["p"] >= 0.05 and result["difference"] >= 0
+
+
+def test_a_difference_that_the_structure_of_a_machine_turns_round_is_none_that_another_would_keep():
+    structure = PLANT % 5
+    a, b = costs(1, own=0.01), costs(2, own=0.01)
+    alike_everywhere = pair("a", "b", {"a": a, "b": 0.9 * b}, PLANT, structure, seed=1)
+    assert alike_everywhere["winner"] == "b" and alike_everywhere["kept"]
+    assert max(alike_everywhere["by_structure"]) - min(alike_everywhere["by_structure"]) < 3
+    # as large on the whole, but by structure +40, +10, +5, 0 and -8 %
+    shares = np.array([0.6, 0.9, 0.95, 1.0, 1.08])
+    turned = pair("a", "b", {"a": a, "b": shares[structure] * b}, PLANT, structure, seed=1)
+    assert turned["difference"] > 8 and turned["p"] < 0.05
+    # three deviations of what differs by case: 0.05 sqrt(2 / 24)
+    np.testing.assert_allclose(turned["by_structure"], 100 * (1 - shares), atol=4.5)
+    assert not turned["kept"] and turned["winner"] is None
 
 
 def test_of_two_alike_one_wins_in_one_of_twenty_panels_and_the_interval_holds_zero_in_nine_of_ten():
     """Over 400 panels: 0.011 is a standard deviation of the first, 0.015 of the second; the difference is
     that of the cheaper one, so that only its lower end can miss zero, at either side."""
-    results = [pair("a", "b", alike(k), FEW, seed=k) for k in range(400)]
+    results = [pair("a", "b", alike(k), FEW, 0 * FEW, seed=k) for k in range(400)]
     assert abs(np.mean([r["winner"] is not None for r in results]) - 0.05) < 0.035
     assert abs(np.mean([r["low"] <= 0 for r in results]) - 0.9) < 0.045
 
@@ -133,8 +151,8 @@ def test_where_one_plant_decides_the_answer_without_it_is_another():
     a[PLANT == 7] *= 1e4
     assert deciding_plant(a, b, PLANT) == 7
     left = PLANT != 7
-    assert pair("a", "b", {"a": a, "b": b}, PLANT, seed=1)["difference"] > 20
-    assert pair("a", "b", {"a": a[left], "b": b[left]}, PLANT[left], seed=1)["difference"] < 2
+    assert pair("a", "b", {"a": a, "b": b}, PLANT, ALIKE, seed=1)["difference"] > 20
+    assert pair("a", "b", {"a": a[left], "b": b[left]}, PLANT[left], ALIKE[left], seed=1)["difference"] < 2
 
 
 # ---- bands

@@ -75,6 +75,7 @@ def test_every_row_has_a_kind_and_a_mark():
         "subspace_lqg": "model-based",
         "varx_riccati": "model-based",
         "learned_kernel": "data-driven",
+        "predictive_control": "data-driven",
         "exact_model": "reference",
     }
     assert kinds.items() >= house.items()

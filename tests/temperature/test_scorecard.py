@@ -346,12 +346,21 @@ def check_run(model, steps):
 
 def test_a_longer_record_is_asked_for_where_noise_costs_too_much(learned):
     u, y, long = learned
-    rule = {"offset": False, "gain_spread": 0.0}
-    half_gap, _ = scorecard.sufficiency([u], [y], long, YARDSTICK, check_run(long, 200), allowed=0.01, **rule)
+    run = check_run(long, 200)
+
+    def law(u, y):
+        half = window_route.learn(u, y, longest=long.N)
+        return window_route.law(half, np.diag(YARDSTICK.q), np.diag(YARDSTICK.r), YARDSTICK.gamma)
+
+    rule = {
+        "whole": scorecard.optimum(run, YARDSTICK)[0],
+        "samples": long.samples,
+        "least": 2 * long.Theta.shape[1],
+    }
+    half_gap, at_least = scorecard.sufficiency([u], [y], law, YARDSTICK, run, allowed=0.01, **rule)
     assert 0 < half_gap < 0.01
-    _, needed = scorecard.sufficiency(
-        [u], [y], long, YARDSTICK, check_run(long, 200), allowed=half_gap / 20, **rule
-    )
+    assert at_least >= rule["least"]
+    _, needed = scorecard.sufficiency([u], [y], law, YARDSTICK, run, allowed=half_gap / 20, **rule)
     assert needed == pytest.approx(10 * long.samples, abs=1)  # half of the gap, over a twentieth of it
 
 

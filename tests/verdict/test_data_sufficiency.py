@@ -32,6 +32,16 @@ def test_a_controller_needs_the_samples_at_which_its_extra_cost_is_allowed(figur
     assert data(figures, "learned_kernel").note == "380 of 1,140 samples; record 760 more"
 
 
+def test_predictive_control_is_charged_with_its_own_half_record_or_with_its_refusal(figures):
+    assert data(figures, "predictive_control").note == "336 of 120 samples"
+    figures["learn_kernel"]["predictive"] = {"refused": "too few stretches; record longer"}
+    gap = data(figures, "predictive_control")
+    assert isinstance(gap, Missing) and (gap.state, gap.reason) == (
+        "failed",
+        "too few stretches; record longer",
+    )
+
+
 @pytest.mark.parametrize("name", LEARNED_FROM_THE_PLANT)
 def test_a_plant_that_predicts_too_little_leaves_the_data_undecided(figures, name):
     figures["identify_plant"]["fit_holdout_ahead"]["zone_2"] = 30.0

@@ -59,6 +59,7 @@ def render(sources: Sources, judged: Judgement) -> str:
             pictures.case(sources, judged, "typical"),
             pictures.case(sources, judged, "deciding"),
             pictures.plants(sources),
+            pictures.record_length(sources),
         ],
         findings=findings.findings(sources),
         record=[recording.excitation(sources), recording.record(sources)],

@@ -11,10 +11,10 @@ from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.judgement import Judgement
-from pipeline.verdict.controllers import YARDSTICKS, heading, in_a_sentence, kind
+from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading, in_a_sentence, kind
 from pipeline.verdict.digits import THIN, count, number, short
 from pipeline.verdict.evidence import Table, entry
-from pipeline.verdict.pairs import pair_names, reference_of
+from pipeline.verdict.pairs import curve_sentence, pair_names, reference_of
 from pipeline.verdict.temperature import comparison, names, refused
 from pipeline.verdict.verdict import Missing
 
@@ -291,4 +291,67 @@ def _boxes(cases: pd.DataFrame, names: list[str]) -> Markup:
         words.append(f"{heading(name)} {short(float(middle), 2)}")
     return charts.panel(
         frame, layers, alt=f"Median cost of all cases: {', '.join(words)}", css="mb wide", title=""
+    )
+
+
+# ---- less of the record
+
+
+def record_length(sources: Sources) -> Picture:
+    """Cost against the length of the record, a curve a controller, and where the pair changes places."""
+    title, curve = "Less of the record", entry(comparison(sources.metrics), "cost_curve")
+    if not curve or not curve["controllers"]:
+        why = "evaluate_temperature.cost_curve is false in params.expert.yaml"
+        return placeholder("record_length", title, Missing("not measured", why))
+    minutes = np.array(curve["samples"]) * sources.declared.machine.sample_time_s / 60
+    named = {
+        name: {key: np.array(values, float) for key, values in own.items()}
+        for name, own in curve["controllers"].items()
+        if any(value is not None for value in own["cost"])
+    }
+    every = np.concatenate([values for own in named.values() for values in own.values()])
+    ticks = tuple((float(value), number(float(value), 0)) for value in minutes)
+    frame = charts.Frame(
+        charts.Axis(minutes[0] / 1.2, minutes[-1] * 1.9, ticks, log=True),
+        _costs(every[np.isfinite(every)]),
+        width=720,
+        height=320,
+        left=44,
+        below=34,
+        above=20,
+    )
+    layers = []
+    crossing = entry(curve, "crossing") or {}
+    if crossing.get("low"):
+        ends = (crossing[end] * sources.declared.machine.sample_time_s / 60 for end in ("low", "high"))
+        layers.append(charts.interval(frame, *ends))
+    for name, own in named.items():
+        css = f"line {page.MARKS.get(name, '')}{' dash' if BY_NAME[name].hollow else ''}"
+        known = np.isfinite(own["cost"])
+        layers.append(charts.ribbon(frame, minutes[known], own["low"][known], own["high"][known]))
+        layers.append(charts.line(frame, minutes[known], own["cost"][known], css))
+        layers.append(
+            charts.dots(frame, minutes[known], own["cost"][known], f"dot {page.MARKS.get(name, '')}")
+        )
+        last = np.flatnonzero(known)[-1]
+        layers.append(charts.label(frame, minutes[last], own["cost"][last], heading(name), dx=6, dy=4))
+    lacking = [
+        f"From {number(int(length) * sources.declared.machine.sample_time_s / 60, 0)} min "
+        f"{in_a_sentence(name)} cannot be learned: {why}."
+        for length, reasons in curve["refused"].items()
+        for name, why in reasons.items()
+    ]
+    finding = curve_sentence(sources.metrics)
+    drawn_picture = charts.panel(
+        frame, layers, alt=finding, css="mb wide", title="cost, log", across="minutes of the record, log"
+    )
+    return Picture(
+        "record_length",
+        title,
+        finding,
+        [PictureColumn("Cost", "learned from the beginning of the record", "", [drawn_picture])],
+        "Each controller learned again from the beginning of the record, its weights kept, on "
+        f"{curve['plants']} plants; bands: 90{THIN}% over plants. Nothing is said of longer records. "
+        f"{' '.join(lacking)}",
+        page.origin(sources.source("evaluate_temperature")),
     )

@@ -6,12 +6,14 @@ from functools import partial
 import numpy as np
 
 from pipeline.temperature import tracking
-from pipeline.temperature.controllers import baseline, kernel, window
+from pipeline.temperature.controllers import baseline, kernel, predictive, window
 from pipeline.temperature.controllers import printer_pid as klipper
 from pipeline.temperature.controllers.law import compact
 from pipeline.temperature.controllers.problem import Design, DesignProblem, unit_weights, weights
 from pipeline.temperature.plant import strictly_proper
 from pipeline.temperature.tracking import Law
+
+UNDETERMINED = "the record does not determine it"
 
 
 def hold(problem: DesignProblem, values: Mapping[str, float]) -> Design:
@@ -53,11 +55,18 @@ def varx_riccati(problem: DesignProblem, values: Mapping[str, float]) -> Design:
     return _of_window(problem, values, partial(window.law, problem.window), problem.window.N)
 
 
-def learned_kernel(problem: DesignProblem, values: Mapping[str, float]) -> Design | None:
+def learned_kernel(problem: DesignProblem, values: Mapping[str, float]) -> Design:
     """Its steady inputs come from the window that was learned from the same record."""
     if problem.kernel is None:
-        return None
+        raise ValueError(problem.undetermined.get("learned_kernel", UNDETERMINED))
     return _of_window(problem, values, partial(kernel.law, problem.kernel), problem.kernel.N)
+
+
+def predictive_control(problem: DesignProblem, values: Mapping[str, float]) -> Design:
+    """Its steady inputs come from the window, as those of the learned kernel."""
+    if problem.trajectories is None:
+        raise ValueError(problem.undetermined.get("predictive_control", UNDETERMINED))
+    return _of_window(problem, values, partial(predictive.law, problem.trajectories), problem.trajectories.N)
 
 
 def _of_window(

@@ -12,6 +12,7 @@ from pipeline.temperature.plant import markov_parameters
 if TYPE_CHECKING:
     from pipeline.temperature.controllers.kernel import Regression
     from pipeline.temperature.controllers.law import ActuatorLimits
+    from pipeline.temperature.controllers.predictive import Trajectories
     from pipeline.temperature.controllers.printer_pid import HeaterPid
     from pipeline.temperature.controllers.window import WindowModel
     from pipeline.temperature.plant import Plant
@@ -22,9 +23,10 @@ class DesignProblem(NamedTuple):
     """What a controller may be designed from.
 
     `plant` is identified, its feed-through a delay, `family` its spread, and `window` learned from the
-    record. `kernel` is None if the record does not determine it, `truth` if nobody knows the plant,
-    `printer_pid` is empty if no recording holds the PID of a printer. `gamma` is the discount, `exact_tau`
-    the paper's observer, `horizon` in steps, `noise` (p,) in °C."""
+    record. `kernel` and `trajectories` are None if the record does not determine them, and `undetermined`
+    then says why, by controller. `truth` is None if nobody knows the plant, `printer_pid` empty if no
+    recording holds the PID of a printer. `gamma` is the discount, `exact_tau` the paper's observer, `horizon`
+    in steps, `noise` (p,) in °C."""
 
     plant: Plant
     family: list[Plant]
@@ -37,6 +39,8 @@ class DesignProblem(NamedTuple):
     horizon: int
     noise: np.ndarray
     printer_pid: tuple[HeaterPid, ...] = ()
+    trajectories: Trajectories | None = None
+    undetermined: Mapping[str, str] = {}
 
     @property
     def effect(self) -> float:

@@ -43,13 +43,12 @@ class TemperatureController(NamedTuple):
     the heading alone would say too little. `design` returns None if the record does not allow the controller,
     and raises ValueError if the machine does not: the page shows that sentence in its column. `parameters`
     are what its search may set; without any nothing is searched. `learned_from` says whose need of samples is
-    its own: the identified plant, the window, or the kernel.
+    its own: the identified plant, the window, the kernel, or the trajectories.
 
     `kind` is declared here and nowhere guessed from a name: model-based (a model is identified and then
     inverted or optimised), data-driven (the law is learned from the record without such a model), baseline,
-    or reference. `role`: the pair that is answered for itself is model_based against data_driven. A yardstick
-    is shown beside the others and is never the best. `mark` is the class of its mark; one without takes the
-    next free shape.
+    or reference. A reference is shown beside the others and is never the best. `mark` is the class of its
+    mark; one without takes the next free shape.
     """
 
     name: str
@@ -59,8 +58,7 @@ class TemperatureController(NamedTuple):
     design: Callable[[DesignProblem, Values], Design | None]
     kind: Literal["model-based", "data-driven", "baseline", "reference"]
     parameters: tuple[TuningParameter, ...] = ()
-    learned_from: Literal["plant", "window", "kernel", ""] = ""
-    role: Literal["data_driven", "model_based", "indirect", "baseline", "yardstick", ""] = ""
+    learned_from: Literal["plant", "window", "kernel", "trajectories", ""] = ""
     word: str = ""
     mark: Literal["dd", "mb", "bl", ""] = ""
     hollow: bool = False
@@ -105,7 +103,6 @@ CONTROLLERS = (
         in_file("designs", "pi"),
         "baseline",
         learned_from="plant",
-        role="baseline",
         mark="bl",
     ),
     TemperatureController(
@@ -131,7 +128,6 @@ CONTROLLERS = (
         "model-based",
         (EFFORT, OBSERVER, INTEGRAL),
         learned_from="plant",
-        role="model_based",
         word="subspace + LQG, model-based",
         mark="mb",
     ),
@@ -145,7 +141,6 @@ CONTROLLERS = (
         "model-based",
         (EFFORT, INTEGRAL),
         learned_from="window",
-        role="indirect",
         word="VARX + Riccati, model-based by least squares",
         mark="mb",
         hollow=True,
@@ -160,9 +155,23 @@ CONTROLLERS = (
         "data-driven",
         (EFFORT, INTEGRAL),
         learned_from="kernel",
-        role="data_driven",
         word="learned kernel, Algorithm 2, data-driven and direct",
         mark="dd",
+    ),
+    TemperatureController(
+        "predictive_control",
+        "predictive control",
+        "data-driven, DeePC",
+        "Data-enabled predictive control: coming inputs and outputs are weighted sums of stretches of the "
+        "record, and the weights are those of least cost. What the sums leave unexplained counts as zero, so "
+        "that it is a least-squares predictor of many steps with a horizon.",
+        in_file("designs", "predictive_control"),
+        "data-driven",
+        (EFFORT, INTEGRAL),
+        learned_from="trajectories",
+        word="predictive control (DeePC), data-driven and direct",
+        mark="dd",
+        hollow=True,
     ),
     TemperatureController(
         "exact_model",
@@ -173,13 +182,9 @@ CONTROLLERS = (
         in_file("designs", "exact_model"),
         "reference",
         (EFFORT, OBSERVER, INTEGRAL),
-        role="yardstick",
     ),
 )
 BY_NAME = {controller.name: controller for controller in CONTROLLERS}
-PAIR = ("subspace_lqg", "learned_kernel")
-INDIRECT = "varx_riccati"
-KERNEL_UNDETERMINED = "the record does not determine the kernel (learn_kernel says why)"
 UNTUNED = "it could not be tuned: no candidate of its search kept the least margins of tune_weights"
 
 
@@ -195,6 +200,24 @@ def bounds(
 def parameters(controller: TemperatureController, theta: Iterable[float]) -> dict[str, float]:
     """The values theta (d,) by the names of the controller's parameters."""
     return dict(zip([one.name for one in controller.parameters], theta, strict=True))
+
+
+def answering_pair(standing: Iterable[str], tuned_costs: Mapping[str, float]) -> tuple[str, str]:
+    """The model-based controller and the data-driven one that answer "model-based or data-driven?": of each
+    kind, of those that stand, the one that its search found cheapest on the training plants, so that the
+    plants that compare the two have no say in who is compared. If no data-driven one stands, the second
+    model-based one takes its place; a kind of which none stands is named by its first row."""
+    standing = set(standing)
+
+    def ranked(kind: str) -> list[str]:
+        names = [one.name for one in CONTROLLERS if one.kind == kind]
+        able = [name for name in names if name in standing]
+        return sorted(able, key=lambda name: tuned_costs.get(name, np.inf)) or names[:1]
+
+    model_based, data_driven = ranked("model-based"), ranked("data-driven")
+    if data_driven[0] not in standing and len(model_based) > 1:
+        return model_based[0], model_based[1]
+    return model_based[0], data_driven[0]
 
 
 def design_controllers(
@@ -216,9 +239,8 @@ def design_controllers(
             refused[controller.name] = str(reason)
             continue
         if design is None:
-            if controller.role == "data_driven":
-                refused[controller.name] = KERNEL_UNDETERMINED
-        elif untuned:
+            continue
+        if untuned:
             refused[controller.name] = UNTUNED
         else:
             designs[controller.name] = design

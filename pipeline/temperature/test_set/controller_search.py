@@ -29,10 +29,15 @@ def search(
     the record does not allow it."""
     controller = table.BY_NAME[name]
     low, start, high = table.bounds(controller, problem)
-    try:
-        design = controller.design(problem, table.parameters(controller, start))
-    except ValueError as refusal:
-        return name, str(refusal)
+    # a kernel may have no minimum at the start, and one where inputs cost more
+    for theta in (start, np.sqrt(start * high), high):
+        try:
+            design = controller.design(problem, table.parameters(controller, theta))
+            break
+        except ValueError as reason:
+            refusal = str(reason)
+    else:
+        return name, refusal
     if design is None:
         return name, ""
     rests = panel.rests(design.model, setting.rehearsal.training, setting.limits)

@@ -188,20 +188,23 @@ def decide(
     entrants: list[str],
     summary: Mapping[str, Any],
     setting: panel.CaseConditions,
+    tuned: Mapping[str, float],
     seed: int,
 ) -> dict[str, Any]:
-    """The pair, and the plant that decides, with the pair's answer without it."""
+    """The pair, and the plant that decides, with the pair's answer without it. `tuned` are the costs of the
+    searches, by controller."""
     block = setting.rehearsal.judging.plant
     costs = {name: results[name].costs for name in entrants}
-    a, b = table.PAIR
-    b = b if b in costs else table.INDIRECT
+    a, b = table.answering_pair(entrants, tuned)
     one, two = a, b
     if not (a in costs and b in costs):
         one, two = entrants[max(len(entrants) - 2, 0)], entrants[-1]
     index = scorecard.deciding_plant(costs[one], costs[two], block)
     rest = block != index
     without = {name: values[rest] for name, values in costs.items()}
-    pair = _pair(a, b, costs, block, summary, seed)
+    # structures take turns over the plants
+    kind = block % len(panel.STRUCTURES)
+    pair = _pair(a, b, costs, block, kind, summary, seed)
     mine = np.flatnonzero(block == index)
     worst = mine[
         np.abs(np.log(np.maximum(costs[one][mine], 1e-9) / np.maximum(costs[two][mine], 1e-9))).argmax()
@@ -210,7 +213,7 @@ def decide(
         "pair": pair,
         "deciding": {
             **_case(setting.rehearsal.judging, int(worst)),
-            "pair_without": _pair(a, b, without, block[rest], summary, seed)["winner"]
+            "pair_without": _pair(a, b, without, block[rest], kind[rest], summary, seed)["winner"]
             if pair["p"] is not None
             else None,
         },
@@ -218,15 +221,16 @@ def decide(
 
 
 def _pair(
-    a: str, b: str, costs: Mapping[str, np.ndarray], block: np.ndarray, summary, seed: int
+    a: str, b: str, costs: Mapping[str, np.ndarray], block: np.ndarray, kind: np.ndarray, summary, seed: int
 ) -> dict[str, Any]:
     """The pair's answer; without figures if one of the two is refused."""
     if a not in costs or b not in costs:
-        return {"a": a, "b": b, "winner": None, "difference": None, "low": None, "high": None, "p": None,
-                "plants": len(np.unique(block)), "figures": {}}  # fmt: skip
+        unknown = dict.fromkeys(("winner", "difference", "low", "high", "p", "kept"))
+        plants = len(np.unique(block))
+        return {"a": a, "b": b, **unknown, "by_structure": [], "plants": plants, "figures": {}}
     figures = summary["contestants"]
     return {
-        **scorecard.pair(a, b, costs, block, seed=seed),
+        **scorecard.pair(a, b, costs, block, kind, seed=seed),
         "plants": len(np.unique(block)),
         "figures": {
             name: [figures[one][name]["q90"] for one in (a, b)]

@@ -6,7 +6,7 @@ plant decides; and what a record is enough for. What a controller does as deploy
 Cases of one plant stand or fall together: plants are the blocks of every test and of every band.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -254,22 +254,37 @@ def between(champion: np.ndarray, challenger: np.ndarray, plant: np.ndarray, *, 
     )
 
 
-def pair(a: str, b: str, costs: Mapping[str, np.ndarray], plant: np.ndarray, *, seed: int) -> dict[str, Any]:
-    """Of two contestants a and b the `winner`, the cheaper one beyond chance, None where nobody is; by how
-    many percent of the other's cost the cheaper one is so (`difference`), beyond chance or not, with the ends
-    `low` and `high` of the 90 % interval and the two-sided `p`."""
+def pair(
+    a: str, b: str, costs: Mapping[str, np.ndarray], plant: np.ndarray, structure: np.ndarray, *, seed: int
+) -> dict[str, Any]:
+    """Of two contestants a and b the `winner`, the cheaper one beyond chance and beyond what the structure of
+    a machine changes, None where nobody is; by how many percent of the other's cost the cheaper one is so
+    (`difference`), with the ends `low` and `high` of the 90 % interval, the two-sided `p`, and
+    `by_structure` the same difference on the plants of each structure (s,).
+
+    `kept`: the difference is larger than the range of those. The range of five is some 2.33 deviations, and
+    half of the 90 % interval for one more is 2.34: another structure would then keep the sign.
+    """
     forward = between(costs[b], costs[a], plant, seed=seed)
     backward = between(costs[a], costs[b], plant, seed=seed)
     cheaper, result = (a, forward) if forward.improvement_percent >= 0 else (b, backward)
-    p = min(1.0, 2 * result.p)
+    p, dearer = min(1.0, 2 * result.p), b if cheaper == a else a
+    own = [structure == kind for kind in np.unique(structure)]
+    by_structure = [
+        between(costs[dearer][rows], costs[cheaper][rows], plant[rows], seed=seed).improvement_percent
+        for rows in own
+    ]
+    kept = result.improvement_percent > np.ptp(by_structure)
     return {
         "a": a,
         "b": b,
-        "winner": cheaper if p < LEVEL else None,
+        "winner": cheaper if p < LEVEL and kept else None,
         "difference": result.improvement_percent,
         "low": result.low_percent,
         "high": result.high_percent,
         "p": p,
+        "by_structure": by_structure,
+        "kept": bool(kept),
     }
 
 
@@ -316,35 +331,29 @@ def mean_and_worst(costs: np.ndarray, plant: np.ndarray, *, weight: float) -> fl
 def sufficiency(
     u: Sequence[np.ndarray],
     y: Sequence[np.ndarray],
-    learned: window_route.WindowModel,
+    learn: Callable[[Sequence[np.ndarray], Sequence[np.ndarray]], Law],
     yardstick: CommonCost,
     scenarios: Scenarios,
     *,
+    whole: float,
+    samples: int,
+    least: int,
     allowed: float,
-    offset: bool,
-    gain_spread: float,
 ) -> tuple[float, int]:
     """Whether the record is long enough for its noise, by the record alone: the extra cost of a controller
-    learned from half of it, the mean of both halves, on `scenarios` of the model learned from all of it; and
-    at how many samples it would be the excess `allowed`, as it falls as one over the samples."""
-    best = optimum(scenarios, yardstick)
+    that `learn` makes of half of it, the mean of both halves, on `scenarios` of the model learned from all of
+    its `samples`, where the one of the whole record costs `whole`; and at how many samples it would be the
+    excess `allowed`, as it falls as one over the samples, `least` of them at least."""
     gaps = []
     for part in (0, 1):
         half_u, half_y = (
             [rows[part * len(rows) // 2 : (part + 1) * len(rows) // 2] for rows in signal]
             for signal in (u, y)
         )
-        half = window_route.learn(half_u, half_y, longest=learned.N, offset=offset, gain_spread=gain_spread)
-        law = window_route.law(half, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma)
-        run = simulate(scenarios, law)
-        gaps.append((cost(scenarios, run, yardstick) / best - 1)[0])
+        run = simulate(scenarios, learn(half_u, half_y))
+        gaps.append(cost(scenarios, run, yardstick)[0] / whole - 1)
     half_gap = float(np.mean(gaps))
-    # never fewer than twice the numbers of one output's predictor:
-    # below that the half-record test itself means nothing
-    needed = max(
-        np.ceil(learned.samples * min(half_gap / 2 / allowed, 1e3)), 2 * (learned.Theta.shape[1] + offset)
-    )
-    return half_gap, int(needed)
+    return half_gap, max(int(np.ceil(samples * min(half_gap / 2 / allowed, 1e3))), least)
 
 
 class KernelCandidate(NamedTuple):
