@@ -148,7 +148,7 @@ def _without_gcode(sources: Sources) -> int:
     return int(found.get("recording", {}).get(WITHOUT_GCODE, 0))
 
 
-def deciding(sources: Sources, judged: Judgement) -> Deciding | Missing:
+def deciding(sources: Sources, judged: Judgement, size: tuple[int, int] = PICTURE) -> Deciding | Missing:
     """The output furthest from its reference in the deciding case, a line a contestant."""
     table = sources.tables["trajectories"]
     if isinstance(table, Missing):
@@ -166,7 +166,7 @@ def deciding(sources: Sources, judged: Judgement) -> Deciding | Missing:
     finding = f"{label[:1].upper()}{label[1:]} ends off its reference by, in °C: {listed}. Grey: the limit."
     return Deciding(
         finding,
-        _drawn(table, early, zone, sources.declared.rules.settled_error_degC, finding, PICTURE),
+        _drawn(table, early, zone, sources.declared.rules.settled_error_degC, finding, size),
         "",
         page.in_viewer("trajectories", case_name=["deciding"], contestant=list(runs), y=[zone]),
     )

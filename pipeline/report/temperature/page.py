@@ -3,12 +3,15 @@ words."""
 
 from pipeline.report.shared import headline, page, words
 from pipeline.report.shared.difference import accepted_on
+from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import findings, pictures, recording, scorecard, twelve
+from pipeline.report.temperature.card import deciding
 from pipeline.report.temperature.judgement import Judgement, heads, verdict_parts
 from pipeline.verdict.controllers import BY_NAME
 from pipeline.verdict.temperature import comparison, refused
 from pipeline.verdict.temperature import names as names_judged
+from pipeline.verdict.verdict import Missing
 
 WORDS = (
     "verdict",
@@ -33,6 +36,15 @@ WORDS = (
 )
 
 
+def worst_zone(sources: Sources, judged: Judgement) -> Picture:
+    """The controllers over one another in the case that decides: the error of the worst zone."""
+    title, found = "The case that decides: error of the worst zone", deciding(sources, judged, (760, 240))
+    if isinstance(found, Missing):
+        return placeholder("worst-zone", title, found)
+    column = PictureColumn("", "", "", [found.drawn])
+    return Picture("worst-zone", title, found.finding, [column], "", found.origin)
+
+
 def render(sources: Sources, judged: Judgement) -> str:
     """The text of temperature.html."""
     contestants = [
@@ -55,12 +67,8 @@ def render(sources: Sources, judged: Judgement) -> str:
         deciding=judged.deciding,
         scorecard=scorecard.scorecard(sources, judged, words.ANSWERS_WORDS),
         infeasible=scorecard.infeasible(sources),
-        at_work=[
-            pictures.case(sources, judged, "typical"),
-            pictures.case(sources, judged, "deciding"),
-            pictures.plants(sources),
-            pictures.record_length(sources),
-        ],
+        at_work=[worst_zone(sources, judged), pictures.plants(sources), pictures.record_length(sources)],
+        cases=[pictures.case(sources, judged, name) for name in ("typical", "deciding")],
         findings=findings.findings(sources),
         record=[recording.excitation(sources), recording.record(sources)],
         flaws=recording.flaws(sources),
