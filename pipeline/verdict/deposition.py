@@ -270,7 +270,8 @@ def pair_sentence(evidence: Evidence) -> PairSentence:
     )
     spent = evidence.tables.get("prints")
     turns = "" if not isinstance(spent, Mapping) else _turns(pd.DataFrame(spent), better, worse)
-    short = f"{head} {phrase(better)}, {number(ratio, 2)} of the other’s error ({band(*ends, 2)})."
+    loser = phrase(worse).split(" by ")[0]
+    short = f"{head} {phrase(better)}, {number(ratio, 2)} of the error of {loser} ({band(*ends, 2)})."
     return PairSentence(f"{head} {text}.", better, short, turns)
 
 

@@ -52,7 +52,7 @@ def pair_sentence(figures: Figures) -> PairSentence:
     amount = "far less" if not gain <= 90 else f"{number(gain, 0 if gain >= 10 else 1)} % less"
     interval = _interval(pair) if gain <= 90 else ""
     text = f"{better} costs {amount} than {worse} on the same {plants} plants"
-    short = f"{head} {better}, {amount.replace('less', 'lower')} cost{_bracket(interval)}."
+    short = f"{head} {better}, {amount.replace('less', 'lower')} cost than {worse}{_bracket(interval)}."
     return PairSentence(f"{head} {text}{_bracket(interval, by_structure)}.", str(winner), short, instead)
 
 
