@@ -53,6 +53,7 @@ def pair_sentence(figures: Figures) -> PairSentence:
     interval = _interval(pair) if gain <= 90 else ""
     text = f"{better} costs {amount} than {worse} on the same {plants} plants"
     short = f"{head} {better}, {amount.replace('less', 'lower')} cost than {worse}{_bracket(interval)}."
+    short = f"{short} {instead}".strip()
     return PairSentence(f"{head} {text}{_bracket(interval, by_structure)}.", str(winner), short, instead)
 
 

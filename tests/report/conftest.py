@@ -90,9 +90,9 @@ def timers_fired(page):
     page.evaluate("() => new Promise(done => setTimeout(done, 200))")
 
 
-def loaded(browser, folder, name, *, width=1280, height=800, theme="light", script=True):
-    """A page in a browser context of its own; the addresses that it asked for in .asked, the messages of its
-    console in .console."""
+def loaded(browser, folder, name, *, width=1280, height=800, theme="light", script=True, folded=False):
+    """A page in a browser context of its own, what it folds opened unless `folded`; the addresses that it
+    asked for in .asked, the messages of its console in .console."""
     context = browser.new_context(
         viewport={"width": width, "height": height}, color_scheme=theme, java_script_enabled=script
     )
@@ -103,6 +103,8 @@ def loaded(browser, folder, name, *, width=1280, height=800, theme="light", scri
     page.on("pageerror", lambda error: page.console.append(str(error)))
     page.on("dialog", lambda dialog: page.console.append(dialog.message))
     page.goto(f"file://{folder}/{name}.html")
+    if script and not folded:
+        page.evaluate("document.querySelectorAll('details.more').forEach(one => { one.open = true; })")
     return page
 
 

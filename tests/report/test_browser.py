@@ -68,7 +68,10 @@ def test_a_page_says_the_same_without_a_script(shown, unscripted):
     # a script adds the arrows of style sheets, which are no text, and the date of the run in its own column
     column = shown.locator("[data-run-column]")
     column.evaluate_all("cells => cells.forEach(cell => { cell.hidden = true; })")
+    folded = shown.locator("details.more")
+    folded.evaluate_all("all => all.forEach(one => { one.open = false; })")
     said = shown.locator("main").inner_text()
+    folded.evaluate_all("all => all.forEach(one => { one.open = true; })")
     column.evaluate_all("cells => cells.forEach(cell => { cell.hidden = false; })")
     for run in shown.locator("[data-run]").all_inner_texts():
         said = said.replace(run, unscripted.locator("[data-run]").inner_text())
@@ -267,9 +270,11 @@ def test_text_from_the_data_runs_nothing_even_where_it_were_not_escaped(open_pag
     assert page.evaluate("window.hit") is None
 
 
-@pytest.mark.parametrize(("name", "closed"), [("deposition", ("declared", "columns"))])
+@pytest.mark.parametrize(
+    ("name", "closed"), [("deposition", ("declared", "lines")), ("setpoint", ("vision", "ways"))]
+)
 def test_a_second_level_of_detail_is_closed_opens_at_its_heading_and_prints(open_page, name, closed):
-    page = open_page(name)
+    page = open_page(name, folded=True)
     inside = {
         heading: page.locator(f"details:has(> summary > #{heading}) > :not(summary)") for heading in closed
     }

@@ -56,7 +56,8 @@ def test_who_was_chosen_is_accepted_shown_beside_the_others_and_decides_nothing(
     main()
     assert "Pass (simulation): subspace + LQG." in Page(TEMPERATURE).text
     assert "It was named before" not in Page(INDEX).text
-    assert "as before" in Page(INDEX).text
+    # the accepted one stands beside the pair
+    assert "VARX + Riccati" in Page(INDEX).text
 
 
 def test_a_changed_parameter_code_and_artifact_are_counted_and_the_parameter_is_named(accepted):
@@ -82,7 +83,7 @@ def test_a_figure_moves_where_its_band_leaves_the_accepted_one_and_only_there(ac
     text = Page(INDEX).text
     # accepted overshoot 0.3 to 0.9: the bands overlap; settling 5 to 8: they do not
     assert re.search(r"1 of \d+ figures moved beyond their noise\.", text)
-    assert re.search(r"Temperature 1 of \w+ figures moved: settling \S+ s · worse", text)
+    assert re.search(r"Temperature: 1 of \w+ figures moved: settling \S+ s · worse", text)
 
 
 def test_an_accepted_run_of_the_earlier_comparison_is_said_to_have_no_such_figures(accepted):
@@ -91,7 +92,7 @@ def test_an_accepted_run_of_the_earlier_comparison_is_said_to_have_no_such_figur
     artifacts.write_json("reports/accepted.json", run)
     main()
     text = Page(INDEX).text
-    assert "Temperature nothing to compare with." in text
+    assert "Temperature: nothing to compare with." in text
     assert "Nothing changed" not in text and "figures moved" not in text
 
 
@@ -104,7 +105,7 @@ def test_a_flow_error_moves_by_more_than_half_a_point_and_stands_on_both_pages(a
     main()
     assert said in Page(DEPOSITION).text
     text = Page(INDEX).text
-    assert ("Deposition 1 of one figure moved: flow error, square, A" in text) == bool(moved)
+    assert ("Deposition: 1 of one figure moved: flow error, square, A" in text) == bool(moved)
 
 
 def test_a_run_whose_pages_are_older_than_its_figures_is_not_accepted(accepted, capsys):
@@ -121,5 +122,5 @@ def test_page_one_does_not_say_that_nothing_moved_where_a_figure_of_the_rival_di
     change("evaluate_temperature", contestants__learned_kernel__settling=made.figure(9.0, 8.5, 9.5))
     main()
     text = Page(INDEX).text
-    assert re.search(r"Temperature 1 of \w+ figures moved: settling of the learned kernel ", text)
+    assert re.search(r"Temperature: 1 of \w+ figures moved: settling of the learned kernel ", text)
     assert "Nothing changed" not in text

@@ -38,7 +38,7 @@ WORDS = (
 
 def worst_zone(sources: Sources, judged: Judgement) -> Picture:
     """The controllers over one another in the case that decides: the error of the worst zone."""
-    title, found = "The case that decides: error of the worst zone", deciding(sources, judged, (760, 240))
+    title, found = "The case that decides: error of the worst zone", deciding(sources, judged, (566, 230))
     if isinstance(found, Missing):
         return placeholder("worst-zone", title, found)
     column = PictureColumn("", "", "", [found.drawn])
