@@ -18,7 +18,7 @@ L32 above the diagonal belong to inputs that come later than the output, and are
 in closed form: linear in the window, because limits, governor and integrator stand outside it.
 
 Breschi, Chiuso, Formentin, "Data-driven predictive control in a stochastic setting: a unified framework",
-Automatica 152 (2023), (14)-(19); the zeros of L32 are those of Sader et al., "Causality-informed data-driven
+Automatica (2023), its LQ form; the zeros of L32 are those of Sader et al., "Causality-informed data-driven
 predictive control", arXiv 2311.09545 (2023).
 """
 
