@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipeline.papers import relearned
+from pipeline.papers import made, relearned
 from tests.house import PAPERS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -95,7 +95,12 @@ def test_one_relearning_at_toy_size_is_of_the_shape_that_is_on_file(monkeypatch)
     assert (ROOT / "reports/metrics/evaluate_temperature.json").read_bytes() == kept
     on_file = json.loads((ROOT / "datasets/papers/relearned.json").read_text())
     figures = relearned.figures([run])
-    assert set(figures) <= set(on_file["contestants"]) and "subspace_lqg" in figures
+    # relearning takes hours: a controller may be newer than the file if the page says that the file is older
+    newer = set(figures) - set(on_file["contestants"])
+    table = "pipeline/temperature/controllers/table.py"
+    assert not newer or table in made.changed("relearned")
+    assert not newer or "the method has changed since" in made.sentence("relearned")
+    assert "subspace_lqg" in figures
     assert set(relearned.answers([run])) == set(on_file["answers"])
     band = figures["subspace_lqg"]["cost"]["q90"]
     assert band["low"] == band["median"] == band["high"] > 0
