@@ -16,7 +16,7 @@ from stages.segment_library import SegmentLibrary, wait
 
 if TYPE_CHECKING:
     from pipeline.deposition.parts.composition import LearnedLibrary
-    from pipeline.deposition.parts.evaluation import Judging, Learning
+    from pipeline.deposition.parts.evaluation import Judging
     from pipeline.deposition.parts.part import ComposedPart
 
 # the trials of each routine that a simulated machine's parts are composed from, beside all of them
@@ -70,11 +70,11 @@ def main() -> None:
             (part, evaluation.evaluate(learned, part.composed, part.conformance.lines, judging, rng))
             for part in tqdm(parts.values(), desc="compose_parts: parts", mininterval=2)
         ]
-        prints = [(part, course) for part, (_, course) in scored]
+        prints = [part_report.print_rows(part, course) for part, (_, course) in scored]
         if judging.plants:
             prints += learn_from_fewer(parts, learned, printer, settings, judging)
         scored = [(part, scores) for part, (scores, _) in scored]
-        rows = part_report.rows(scored) | {"prints": part_report.print_rows(prints)}
+        rows = part_report.rows(scored) | {"prints": part_report.stacked(prints)}
         schemas = {"signals": SIGNALS, "scores": SCORES, "tasks": TASKS, "lines": LINES, "prints": PRINTS}
         for name, schema in schemas.items():
             artifacts.write_table(out / f"{name}.parquet", schema, rows[name])
@@ -129,12 +129,12 @@ def compose_part(
 def learn_from_fewer(
     parts: dict[Path, ComposedPart], learned: LearnedLibrary, printer: Printer, settings: ComposeParts,
     judging: Judging,
-) -> list[tuple[ComposedPart, list[Learning]]]:  # fmt: skip
-    """Each part as the first TRIALS of every routine alone would have it composed, and as `learned` from all
-    of them has it, with the true errors."""
+) -> list[dict[str, list]]:  # fmt: skip
+    """Rows of the true errors of each part, as the first TRIALS of every routine alone would have it composed
+    and as `learned` from all of them has it. One part at a time is held beside `parts`."""
     from tqdm import tqdm
 
-    from pipeline.deposition.parts import composition, evaluation, stored
+    from pipeline.deposition.parts import composition, evaluation, part_report, stored
 
     law, path = params.load(SegmentLibrary, "segment_library").law, "datasets/train_ilc/lessons.parquet"
     samples = artifacts.read_table(path, LESSONS)
@@ -143,19 +143,20 @@ def learn_from_fewer(
     trials, found = max(len(one.u) for one in trainings), []
     for count in tqdm([*(n for n in TRIALS if n < trials), trials], desc="compose_parts: from fewer trials"):
         fewer = [one._replace(u=one.u[:count], y=one.y[:count]) for one in trainings]
-        then, composed = learned, list(parts.values())
+        then = learned
         if count < trials:
             try:
                 then = composition.learn(fewer, sample_time_s=printer.sample_time_s)
-                composed = [compose_part(path, then, printer, settings) for path in parts]
             except ValueError:
                 continue  # of so few trials nothing is learned
-        for part in composed:
+        for path, known in parts.items():
+            part = known if then is learned else compose_part(path, then, printer, settings)
             prints = [
                 sum(len(one.u) for one in fewer if one.material == stream.material)
                 for stream in part.composed.streams
             ]
-            found.append((part, evaluation.learned_from(then, part.composed, judging, prints)))
+            learning = evaluation.learned_from(then, part.composed, judging, prints)
+            found.append(part_report.print_rows(part, learning))
     return found
 
 

@@ -158,12 +158,11 @@ def score_rows(part: ComposedPart, scores: Sequence[ComposerScore]) -> dict[str,
     return {"part": [part.name] * len(scores), "material": materials} | columns
 
 
-def print_rows(learned: Sequence[tuple[ComposedPart, Sequence[Learning]]]) -> dict[str, list]:
-    """One row a composer of every stream of every part, after each number of prints."""
-    rows = [(part, one) for part, learning in learned for one in learning]
-    columns = {name: [getattr(one, name) for _, one in rows] for name in Learning._fields[1:]}
-    materials = [part.composed.streams[one.stream].material for part, one in rows]
-    return {"part": [part.name for part, _ in rows], "material": materials} | columns
+def print_rows(part: ComposedPart, learning: Sequence[Learning]) -> dict[str, list]:
+    """One row a composer of every stream of a part, after each number of prints."""
+    columns = {name: [getattr(one, name) for one in learning] for name in Learning._fields[1:]}
+    materials = [part.composed.streams[one.stream].material for one in learning]
+    return {"part": [part.name] * len(learning), "material": materials} | columns
 
 
 def task_rows(part: ComposedPart) -> dict[str, np.ndarray]:
