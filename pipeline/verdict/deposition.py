@@ -258,10 +258,14 @@ def pair_sentence(evidence: Evidence) -> PairSentence:
     same = f"on the same {count(len(ratios), 'stream')}"
     interval = f"90{THIN}% interval {band(*ends, 2)}"
     if log.low <= 0 <= log.high:
-        needed = math.ceil(len(ratios) * (((log.high - log.low) / 2 / log.value) ** 2 - 1))
+        half = (log.high - log.low) / 2
         text = f"undecided between {phrase(OURS)} and {phrase(other)} {same}"
         text += f" (ratio of their flow errors {number(ratio, 2)}, {interval})"
-        more = f"about {count(needed, 'more stream')} would tell"
+        if log.value == 0.0:
+            more = "no number of streams would tell"
+        else:
+            needed = math.ceil(len(ratios) * ((half / log.value) ** 2 - 1))
+            more = f"about {count(max(needed, 1), 'more stream')} would tell"
         return PairSentence(f"{head} {text}; {more}.", None, f"{head} undecided; {more}.")
     leave = "leave" if better == OURS else "leaves"
     text = (

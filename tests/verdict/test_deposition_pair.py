@@ -70,6 +70,11 @@ def test_streams_that_disagree_are_undecided_and_the_number_that_would_tell_is_s
     assert f"about {math.ceil(2 * ((half / mean) ** 2 - 1)):,} more streams would tell" in found.text
 
 
+def test_composers_that_are_equal_are_undecided_and_no_number_of_streams_would_tell():
+    found = pair_sentence(evidence({"a": errors(2.0, 2.0, 2.0), "b": errors(3.0, 3.0, 3.0)}))
+    assert found.winner is None and "no number of streams would tell" in found.text
+
+
 @pytest.mark.parametrize("streams", [{}, {"a": errors(1.0, 2.0, 2.0)}])
 def test_less_than_two_streams_tell_nothing(streams):
     assert pair_sentence(evidence(streams)).winner is None

@@ -169,12 +169,13 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     first, more = cases[0], len(cases) - MOST_CASES
     listed = ", ".join(f"{name} {_text(scores, name, first, what)}" for name in names)
     entrants = [Entrant(role(scores, name), name, "") for name in names]
+    low, high = deciding_case.MIDDLE
     traced = deciding_case.panel(sources, scores, first, names)
     if not isinstance(traced, Missing):
         return Deciding(
             f"Runs that {does} in {within(first)}: {listed}.",
             traced,
-            f"Median and 80{THIN}% of the runs; dashed: ±{FLOW_BAND:g}{THIN}%.",
+            f"Median and {high - low}{THIN}% of the runs; dashed: ±{FLOW_BAND:g}{THIN}%.",
             page.linked(sources.source("paths"), short=True),
             entrants,
         )
