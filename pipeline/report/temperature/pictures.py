@@ -301,7 +301,8 @@ def record_length(sources: Sources) -> Picture:
     """Cost against the length of the record, a curve a controller, and where the pair changes places."""
     title, curve = "Less of the record", entry(comparison(sources.metrics), "cost_curve")
     if not curve or not curve["controllers"]:
-        why = "evaluate_temperature.cost_curve is false in params.expert.yaml"
+        off = "evaluate_temperature.cost_curve is false in params.expert.yaml"
+        why = "No model-based or data-driven controller was learned" if curve else off
         return placeholder("record_length", title, Missing("not measured", why))
     minutes = np.array(curve["samples"]) * sources.declared.machine.sample_time_s / 60
     named = {
