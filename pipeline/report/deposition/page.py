@@ -102,7 +102,11 @@ def render(sources: Sources) -> str:
         maps=deposition_parts.maps(sources),
         stretches=deposition_parts.stretches(sources),
         by_prints=deposition_parts.by_prints(sources),
-        library={"rule": NAMES[data_driven(measured)], "mark": MARK[data_driven(measured)]},
+        library={
+            "rule": NAMES[data_driven(measured)],
+            "mark": MARK[data_driven(measured)],
+            "compared": any(one.error(data_driven(measured)) is not None for one in measured),
+        },
         lines=deposition_parts.lines(sources),
         forecasts=deposition_parts.forecasts(sources),
         extruded=deposition_parts.extruded(sources),
