@@ -2,9 +2,10 @@
 
 OPTIONS are those of uv, in one word; COMMAND begins with dvc or beadline. Before it, files that are no
 recordings and parameters that fit no section are refused, a table of locks that a killed DVC left empty is
-removed, and reports/machine.js says where the pages are made. If the pages are those of this `dvc repro`, the
-last line is the verdict. DVC runs in this process: a signal reaches it, and its exit status is the one of
-`run`. Only the standard library is imported: DVC itself takes most of a repro with nothing to do.
+removed, and reports/machine.js says where the pages are made. Loops without results run side by side, each in
+a DVC of its own, before the one that does the rest. If the pages are those of this `dvc repro`, the last line
+is the verdict. DVC runs in this process: a signal reaches it, and its exit status is the one of `run`. Only
+the standard library is imported: DVC itself takes most of a repro with nothing to do.
 """
 
 import contextlib
@@ -20,6 +21,7 @@ from pathlib import Path
 
 import stages
 from pipeline.recordings.plain_files import check_plain_files
+from pipeline.side_by_side import new_loops, run_loops
 from pipeline.store.printable import printable
 
 # a link to this folder stays in the project that has the link
@@ -36,6 +38,7 @@ def main() -> None:
     words = " ".join(command) + " "
     shows_only = {"--help", "-h", "--dry"}.intersection(command)
     elsewhere = {"--queue", "--temp", "--watch"}.intersection(command)
+    loops: dict[str, bool] = {}
     if words.startswith(MAKES_PAGES) and not shows_only and not elsewhere:
         write_machine(options)
     if words.startswith("dvc "):
@@ -44,14 +47,18 @@ def main() -> None:
         try:
             for folder in dict.fromkeys([RAW, Path(os.path.relpath(ROOT / RAW))]):
                 check_plain_files(folder)
-            check_params(runs_stages=words.startswith(RUNS_STAGES) and not shows_only)
+            loops = check_params(runs_stages=words.startswith(RUNS_STAGES) and not shows_only)
         except ValueError as error:
             sys.exit(f"run: {printable('; '.join(str(error).splitlines()))}")
     if command[0] != "dvc":
         os.execvp(command[0], command)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, end_with_children)
     page = ROOT / "reports/index.html"
     before = version(page)
-    status = run_dvc(command)
+    new = new_loops(loops, ROOT / "datasets") if command == ["dvc", "repro"] else {}
+    status = run_loops(new, [sys.executable, "-P", __file__, options, "dvc"]) if len(new) > 1 else 0
+    status = status or run_dvc(command)
     # of stages by name, report may be none
     names_stages = any(not word.startswith("-") for word in command[2:])
     is_new = version(page) != before or not names_stages
@@ -61,24 +68,24 @@ def main() -> None:
     sys.exit(status)
 
 
-def check_params(*, runs_stages: bool) -> None:
-    """Raises ValueError with a line for each problem of the parameters. DVC would read them first, by a
-    parser in C that crashes on hostile text; and a stage would find them after those before it."""
+def check_params(*, runs_stages: bool) -> dict[str, bool]:
+    """Section `loops`, {} if nothing is run. Raises ValueError with a line for each problem of the
+    parameters. DVC would read them first, by a parser in C that crashes on hostile text; and a stage would
+    find them after those before it."""
     path = os.path.relpath(ROOT / "params.yaml")
     if runs_stages:
-        stages.check_parameters(path)
-    elif not stages.checked_loops(path):
+        return stages.check_parameters(path)
+    if not stages.checked_loops(path):
         from pipeline.store import params
 
         params.files(path)
+    return {}
 
 
 def run_dvc(command: list[str]) -> int:
     """The exit status of `dvc ...`, as its own script calls it."""
     from dvc.cli import main as dvc
 
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, end_with_children)
     sys.argv = command
     return dvc(command[1:])
 

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from pipeline.side_by_side import ENDS
+
 COPIED = (
     "run", "pyproject.toml", "uv.lock", ".python-version", "pipeline/around_dvc.py", "params.yaml",
     "params.expert.yaml", "datasets/papers/params.yaml",
@@ -24,7 +26,8 @@ DVC = 'def main(arguments):\n    print("dvc", *arguments)\n    return {status}\n
 
 
 def furnish(folder: Path, root: Path, *, status: int = 0) -> None:
-    """Copies `run` and its neighbours from `root`. The DVC of the copy ends with `status`."""
+    """Copies `run` and its neighbours from `root`. The DVC of the copy ends with `status`. Every loop has
+    results of an earlier run."""
     for name in COPIED:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(root / name, folder / name)
@@ -32,6 +35,9 @@ def furnish(folder: Path, root: Path, *, status: int = 0) -> None:
     write(folder / "bin/beadline", '#!/bin/sh\necho beadline "$@"\n')
     write(folder / "fake/dvc/cli.py", DVC.format(status=status))
     write(folder / "fake/dvc/__init__.py", "")
+    for ends in ENDS.values():
+        for end in ends:
+            (folder / "datasets" / end).mkdir(parents=True)
 
 
 def write(path: Path, text: str) -> None:

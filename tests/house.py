@@ -37,7 +37,7 @@ MAY_KNOW: dict[str, set[str]] = {
     "papers": {"methods", "plain", "constants", "files", "store", "statistics", "stages"},
 }
 # who may know every room; room -> who alone may know it
-WHOLE = {"stages", "cli", "quick", "commands", "nightly", "around_dvc"}
+WHOLE = {"stages", "cli", "quick", "commands", "nightly", "around_dvc", "side_by_side"}
 ONLY = {
     "report": {"stages", "cli"},
     "commands": {"cli", "quick", "nightly"},
