@@ -1,5 +1,7 @@
 """Feedback in a record: recognised where it is, not called where it is not, and handled."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,18 @@ def test_a_pi_loop_is_recognised_and_a_plan_is_not_called_one(seed):
 @pytest.mark.parametrize("seed", range(5))
 def test_feed_through_is_not_taken_for_feedback(seed):
     assert not closed_loop(*heater("direct", seed), 10).closed
+
+
+@pytest.mark.parametrize(("kind", "closed"), [("pi", True), ("steps", False)])
+def test_of_a_long_record_stretches_are_tested_and_memory_does_not_grow_with_it(kind, closed):
+    u, y = heater(kind, 1, 120_000)
+    peak = {}
+    for rows in (60_000, 120_000):
+        tracemalloc.start()
+        assert closed_loop([u[0][:rows]], [y[0][:rows]], 20).closed == closed
+        peak[rows] = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak[120_000] < 1.5 * peak[60_000]
 
 
 def test_only_inputs_are_tested_for_feedback_not_measured_disturbances():

@@ -8,6 +8,8 @@ import scipy.stats
 from pipeline.temperature.identification.subspace import Segments, complete_runs, lagged, one_step
 
 LEVEL_CLOSED = 0.001  # of the test for feedback: far below 5 %, as records are less ideal than the test
+# rows that the test looks at, in stretches of so many: a row takes past (m + p) numbers
+MOST, STRETCH = 40_000, 4_000
 
 
 class ClosedLoop(NamedTuple):
@@ -28,7 +30,7 @@ def closed_loop(
     then by as much where an input jumps: a jump of a set-point moves u, and y only later. Of inputs set by a
     plan the statistics are chi-squared, whatever the plan, as errors are white. Jumps are clipped: they would
     drown the small answers to noise, by which feedback is recognised. Only the first `inputs` columns are
-    tested.
+    tested; of a record of more than MOST rows stretches that are spread evenly over it.
     """
     answers = _answers(u, y, past, offset=offset, lags=lags)
     m = inputs or u[0].shape[1]
@@ -61,7 +63,7 @@ def _answers(
     data, untold = (lagged(u, y, past, feedthrough=told, offset=offset) for told in (True, False))
     of_told, of_untold = (one_step(part, past)[0] for part in (data, untold))
     parts = [[], [], [], []]
-    for w in runs:
+    for w in _spread(runs, past + lags + 1):
         z = np.hstack([w[past - lag : len(w) - lag] - data.means[lag] for lag in range(1, past + 1)])
         now_u, now_y = w[past:, :m] - data.means[0, :m], w[past:, m:] - data.means[0, m:]
         told = now_y - np.hstack([now_u, z]) @ of_told
@@ -73,6 +75,16 @@ def _answers(
         parts[3].append((now_y - z @ of_untold)[lags:])
     now, history, before, at_once = (np.concatenate(part) for part in parts)
     return _unforeseen(now, history), before, at_once
+
+
+def _spread(runs: list[np.ndarray], fewest: int) -> list[np.ndarray]:
+    """The runs, or stretches of them that together have at most about MOST rows, each more than `fewest`."""
+    rows = sum(len(w) for w in runs)
+    if rows <= MOST:
+        return runs
+    stretches = [w[start : start + STRETCH] for w in runs for start in range(0, len(w), STRETCH)]
+    every = -(-rows // MOST)
+    return [w for w in stretches if len(w) > fewest][::every]
 
 
 def _unforeseen(now: np.ndarray, history: np.ndarray) -> np.ndarray:
