@@ -29,10 +29,11 @@ from pipeline.papers.published import (
     TUNED_DATA,
     TUNED_MODEL,
     algorithm_1,
+    augmented,
     stabilises,
 )
 from pipeline.papers.study_draws import read_published
-from pipeline.temperature.plant import baam
+from pipeline.temperature.plant import Plant, baam
 from pipeline.temperature.tracking import gains, observer_gain
 
 COMMAND = "./run dvc repro datasets/papers/dvc.yaml:temperature"
@@ -358,16 +359,40 @@ def crossing(*, continuous: bool) -> float:
     return float(high)
 
 
+def iterate_values(
+    plant: Plant, Q: np.ndarray, R: np.ndarray, P: np.ndarray, *, stop: float, most: int = 5000
+) -> tuple[np.ndarray, int]:
+    """The gain K (15) that is greedy for P, and P <- Q_1 + K' R K + gamma (T - B_1 K)' P (T - B_1 K), in turn
+    from any P (n+p, n+p), P = P' >= 0, until the 1-norm of the change of K is at most `stop`: K and the
+    iterations. It begins with no gain, so (18) asks for nothing."""
+    T, B_1, Q_1 = augmented(plant, Q, np.eye(plant.p))
+    K, change, iterations = np.full((plant.m, len(T)), np.inf), np.inf, 0
+    while change > stop and iterations < most:
+        S = R + GAMMA * B_1.T @ P @ B_1
+        K, previous = np.linalg.solve(S, GAMMA * B_1.T @ P @ T), K
+        closed = T - B_1 @ K
+        P = Q_1 + K.T @ R @ K + GAMMA * closed.T @ P @ closed
+        change, iterations = np.linalg.norm(K - previous, 1), iterations + 1
+    return K, iterations
+
+
 def random_starts(seeds: int) -> dict[str, Any]:
     """Algorithm 1 from random K0 ~ N(0, 10): how many policies it takes, None where it misses the stabilising
-    gain; and from the data's own gain (49)."""
+    gain; and from the data's own gain (49). Value iteration from P = K0' K0 of the same draws."""
     plant, identity = baam(), (np.eye(5), np.eye(7))
+    best = gains(plant, *identity, GAMMA)
+    optimal = np.hstack([best.K_x, best.K_r])
 
     def policies(K0: np.ndarray) -> int | None:
         found = algorithm_1(plant, *identity, GAMMA, K0, tolerance=0.1, max_iterations=50)
         return found.iterations if found.settled and stabilises(plant, found.K[:, : plant.n]) else None
 
-    taken = [policies(np.random.default_rng(seed).normal(0.0, 10.0, (7, 11))) for seed in range(seeds)]
+    def values(K0: np.ndarray) -> int | None:
+        K, iterations = iterate_values(plant, *identity, K0.T @ K0, stop=1e-8)
+        return iterations if np.allclose(K, optimal, atol=1e-4) else None
+
+    draws = [np.random.default_rng(seed).normal(0.0, 10.0, (7, 11)) for seed in range(seeds)]
+    taken, iterated = [policies(K0) for K0 in draws], [values(K0) for K0 in draws]
     reached = [count for count in taken if count is not None]
     counts = {str(count): reached.count(count) for count in sorted(set(reached))}
     return {
@@ -375,6 +400,10 @@ def random_starts(seeds: int) -> dict[str, Any]:
         "missed": seeds - len(reached),
         "missed_percent": 100 * (seeds - len(reached)) / seeds,
         "by_policies": counts,
+        "value_iteration": {
+            "missed": iterated.count(None),
+            "most": max((count for count in iterated if count is not None), default=0),
+        },
         "from_K_data": policies(np.hstack([K_DATA, np.zeros((7, 5))])),
     }
 

@@ -295,6 +295,16 @@ def test_the_temperature_results_are_made_of_the_rows_and_the_stop_that_they_nam
     assert found["tuned"]["error"] == found["tried"]["rows_15084"]["error"]
 
 
+@pytest.mark.parametrize("scale", [0.0, 10.0])
+def test_value_iteration_reaches_the_optimal_gain_from_any_kernel(scale):
+    plant, identity = baam(), (np.eye(5), np.eye(7))
+    best = gains(plant, *identity, published.GAMMA)
+    drawn = np.random.default_rng(5).normal(0.0, scale, (7, 11))
+    K, iterations = papers_temperature.iterate_values(plant, *identity, drawn.T @ drawn, stop=1e-8)
+    np.testing.assert_allclose(K, np.hstack([best.K_x, best.K_r]), atol=1e-5)
+    assert iterations <= results("temperature")["algorithm_1"]["value_iteration"]["most"]
+
+
 def test_the_bandwidth_the_gain_and_the_ranks_are_the_machines():
     assert papers_temperature.machine() == pytest.approx(results("temperature")["machine"])
 
