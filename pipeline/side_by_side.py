@@ -17,6 +17,7 @@ ENDS = {
     "deposition": ("compose_parts",),
     "setpoint": ("evaluate_setpoint",),
 }
+CURSOR_UP = "\x1b[A"  # between nested progress bars
 # what DVC says at the end of every run
 HINTS = ("To track the changes", "To enable auto staging", "Use `dvc push`", "\tgit add", "\tdvc config")
 
@@ -77,7 +78,7 @@ def _forward(pipes: selectors.BaseSelector) -> None:
         *lines, rest = left.split(b"\n")
         left[:] = rest.rpartition(b"\r")[2]
         for line in lines:
-            text = line.decode(errors="replace").rstrip("\r").rpartition("\r")[2]
+            text = line.decode(errors="replace").rstrip("\r").rpartition("\r")[2].replace(CURSOR_UP, "")
             if text.strip() and not text.startswith(HINTS):
                 print(f"{loop}: {text}", file=stream, flush=True)
 

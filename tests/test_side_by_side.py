@@ -104,7 +104,7 @@ def test_of_a_progress_bar_the_last_state_is_shown_and_what_dvc_says_at_every_en
 import sys
 def main(arguments):
     if "compose_parts" in arguments:
-        sys.stderr.write("\\rtrials: 10%\\rtrials: 100%\\nno end")
+        sys.stderr.write("\\rtrials: 10%\\rtrials: 100%\\x1b[A\\nno end")
         print("To track the changes with git, run:\\n\\n\\tgit add dvc.lock")
     return 0
 """
