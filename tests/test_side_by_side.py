@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline.side_by_side import ENDS
+from pipeline.side_by_side import ENDS, new_loops
 from tests import fake_uv
 
 
@@ -77,6 +77,17 @@ def test_a_loop_that_has_results_or_is_off_is_left_to_the_rest(copy):
 @pytest.mark.parametrize("command", ["dvc repro -f", "dvc repro train_ilc", "dvc repro --dry", "dvc status"])
 def test_every_other_command_is_one_dvc(copy, command):
     assert fake_uv.run(copy, *command.split()).stdout == f"{command}\n"
+
+
+def test_a_small_machine_runs_one_loop_after_the_other(tmp_path, monkeypatch):
+    memory, on = tmp_path / "meminfo", dict.fromkeys(ENDS, True)
+    memory.write_text("MemTotal:  8000000 kB\nMemAvailable:   3999999 kB\n")
+    assert new_loops(on, tmp_path, memory) == {}
+    memory.write_text("MemAvailable:   4000000 kB\n")
+    assert new_loops(on, tmp_path, memory) == ENDS
+    assert new_loops(on, tmp_path, tmp_path / "none") == ENDS
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    assert new_loops(on, tmp_path, memory) == {}
 
 
 def test_a_loop_that_fails_stops_no_other_and_its_status_is_that_of_run(copy):
