@@ -180,12 +180,17 @@ def ahead_words(evidence: Evidence) -> str:
     )
 
 
-def percent_of(figure: Figure) -> str:
+def percent_of(figure: Figure | Missing) -> str:
+    """A fit with its unit; the state of one that is missing."""
+    if isinstance(figure, Missing):
+        return figure.state
     return quantity(figure.value, "%", min(decimals(figure.low, figure.high, value=figure.value), 1))
 
 
-def band_of(figure: Figure) -> str:
-    """Its ends, empty where they are one."""
+def band_of(figure: Figure | Missing) -> str:
+    """Its ends, empty where they are one, and where it is missing."""
+    if isinstance(figure, Missing):
+        return ""
     places = min(decimals(figure.low, figure.high, value=figure.value), 1)
     return band(figure.low, figure.high, places, unit="%")
 

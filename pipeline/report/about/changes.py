@@ -12,7 +12,8 @@ from pipeline.report.temperature.judgement import Judgement
 from pipeline.verdict.controllers import in_a_sentence
 from pipeline.verdict.deposition import structures
 from pipeline.verdict.digits import count
-from pipeline.verdict.verdict import Missing
+from pipeline.verdict.evidence import gap_of, known
+from pipeline.verdict.verdict import Figure
 
 ANOTHER = "The accepted run is of another machine: nothing to compare."
 # figures of a loop that page one names
@@ -61,8 +62,8 @@ def changes(sources: Sources, judged: Judgement) -> Changes:
     accepted = sources.accepted
     if sources.quick:
         return Changes("A quick look is compared with no run.")
-    if isinstance(accepted, Missing):
-        return Changes("The accepted run cannot be read.", accepted.sentence())
+    if gap := gap_of(accepted):
+        return Changes("The accepted run cannot be read.", gap.sentence())
     if accepted is None:
         return Changes("First run: nothing to compare with.", "./run beadline accept marks this one as good.")
     loops = of_loops(sources, judged)
@@ -109,7 +110,7 @@ def of_loops(sources: Sources, judged: Judgement) -> list[LoopChange]:
 
 def _both(moves: Sequence[Move]) -> int:
     """How many figures both runs have."""
-    return sum(move.before is not None and not isinstance(move.now, Missing) for move in moves)
+    return sum(move.before is not None and isinstance(move.now, Figure) for move in moves)
 
 
 def _moved(move: Move, whose: str = "") -> Moved:
@@ -119,8 +120,7 @@ def _moved(move: Move, whose: str = "") -> Moved:
 
 def deposition_moves(sources: Sources) -> list[Move]:
     """Flow errors of the composer in use, stream by stream."""
-    parts = structures(sources.evidence)
-    return [] if isinstance(parts, Missing) else deposition_change.moves(sources, parts)
+    return deposition_change.moves(sources, known(structures(sources.evidence), []))
 
 
 def inputs(changed: Difference) -> str:

@@ -2,6 +2,7 @@
 which the composer in use fares worst."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -11,14 +12,13 @@ from pipeline.report.shared import page
 from pipeline.report.shared.card import (
     PICTURE,
     Card,
-    CardCell,
-    CardRow,
-    CardStep,
     Deciding,
-    Entrant,
     best_of,
+    cell,
+    entrant,
     in_order,
     of_verdict,
+    step,
 )
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.deposition import (
@@ -33,7 +33,7 @@ from pipeline.verdict.deposition import (
     worst,
 )
 from pipeline.verdict.digits import THIN, band, count, decimals, number
-from pipeline.verdict.evidence import Table
+from pipeline.verdict.evidence import Table, gap_of, need, or_gap, or_nothing
 from pipeline.verdict.verdict import PASSED, Missing, Verdict
 
 MOVES = "Plunger command to flow at the nozzle"
@@ -44,31 +44,27 @@ Read = Callable[[Structure, str], float | None]
 
 def card(sources: Sources, verdict: Verdict) -> Card:
     """Flow error, line volume and what learning the part itself would gain, of three composers."""
-    parts = structures(sources.evidence)
-    step = _step(sources, verdict)
-    if isinstance(parts, Missing):
-        return of_verdict(
-            verdict, MOVES, step, entrants=[], rows=[], basis="", cost="", picture=parts, sources=[],
-            missing=parts.sentence(),
-        )  # fmt: skip
+    parts, next_step = structures(sources.evidence), _step(sources, verdict)
+    if gap := gap_of(parts):
+        return of_verdict(verdict, MOVES, next_step, missing=gap.sentence())
     asked, names = sources.declared.rules, shown(verdict.winner or "", parts)
-    known = [part for part in parts if part.known()]
+    streams = [part for part in parts if part.known()]
     kinds = {name: KIND[name] for name in names}
     return of_verdict(
         verdict,
         MOVES,
-        step,
+        next_step,
         entrants=[
             # "Library", by its better rule
-            Entrant(MARK[name], "Library" if KIND[name] == "data-driven" else NAMES[name], note)
+            entrant(MARK[name], "Library" if KIND[name] == "data-driven" else NAMES[name], note)
             for name, note in in_order(kinds).items()
         ],
         rows=[
-            _row("Flow error", known, names, _error, asked.flow_error_percent, "≤", "%"),
-            _row("Line volume", known, names, _volume, asked.line_volume_percent, "±", "%"),
-            _row("Above learning it", known, names, _above, asked.above_whole_points, "≤", "pts"),
+            _row("Flow error", streams, names, Structure.error, asked.flow_error_percent, "≤", "%"),
+            _row("Line volume", streams, names, Structure.worst_line, asked.line_volume_percent, "±", "%"),
+            _row("Above learning it", streams, names, _above, asked.above_whole_points, "≤", "pts"),
         ],
-        basis=f"Worst of {count(len(known), 'stream')}; small: range",
+        basis=f"Worst of {count(len(streams), 'stream')}; small: range",
         cost=_cost(sources),
         picture=deciding(sources, verdict),
         sources=sources.source("scores"),
@@ -88,10 +84,11 @@ def shown(winner: str, parts: Sequence[Structure]) -> list[str]:
     return list((of_kind | ({KIND[winner]: winner} if winner in KIND else {})).values())
 
 
+@or_nothing
 def _cost(sources: Sources) -> str:
     """Prints that were learned from."""
-    table = sources.tables["trials"]
-    if isinstance(table, Missing) or not len(table["trial"]):
+    table = need(sources.tables["trials"])
+    if not len(table["trial"]):
         return ""
     law = "model_inverse" if (table["law"] == "model_inverse").any() else "pixels"
     mine = table["law"] == law
@@ -104,14 +101,6 @@ def _cost(sources: Sources) -> str:
 # ---- the figures
 
 
-def _error(part: Structure, name: str) -> float | None:
-    return part.error(name)
-
-
-def _volume(part: Structure, name: str) -> float | None:
-    return part.worst_line(name)
-
-
 def _above(part: Structure, name: str) -> float | None:
     """Points above what learned this very part; None where nothing did."""
     both = name in part.scores and "ilc" in part.scores
@@ -121,7 +110,7 @@ def _above(part: Structure, name: str) -> float | None:
 def _row(
     title: str, parts: Sequence[Structure], names: Sequence[str], read: Read, limit: float, sign: str,
     unit: str,
-) -> CardRow:  # fmt: skip
+) -> dict[str, Any]:  # fmt: skip
     """The largest figure of each composer, the range over all streams beside it."""
     each = {name: [value for part in parts if (value := read(part, name)) is not None] for name in names}
     most = [max(values) if values else None for values in each.values()]
@@ -130,39 +119,38 @@ def _row(
         _cell(values, unit, best=max(values, default=None) == best is not None, limit=limit)
         for values in each.values()
     ]
-    return CardRow(title, f"{sign}{'' if sign == '±' else ' '}{limit:g}{THIN}{unit}", cells)
+    limit_text = f"{sign}{'' if sign == '±' else ' '}{limit:g}{THIN}{unit}"
+    return {"title": title, "limit": limit_text, "cells": cells}
 
 
-def _cell(values: Sequence[float], unit: str, *, best: bool, limit: float) -> CardCell:
+def _cell(values: Sequence[float], unit: str, *, best: bool, limit: float) -> dict[str, Any]:
     if not values:
-        return CardCell("not measured")
+        return cell("not measured")
     low, high = min(values), max(values)
     places = min(decimals(low, high, value=high), 1)
-    return CardCell(f"{number(high, places)}{THIN}{unit}", band(low, high, places), best, bad=high > limit)
+    text = f"{number(high, places)}{THIN}{unit}"
+    return cell(text, band(low, high, places), best=best, bad=high > limit)
 
 
-def _step(sources: Sources, verdict: Verdict) -> CardStep:
+def _step(sources: Sources, verdict: Verdict) -> dict[str, str]:
     if verdict.remedy == FIRST_TRIALS:
-        return CardStep(verdict.remedy, "./run dvc repro")
+        return step(verdict.remedy, "./run dvc repro")
     if not verdict.winner and not verdict.remedy:
-        return CardStep("Run the stages of this loop.", "./run dvc repro compose_parts")
+        return step("Run the stages of this loop.", "./run dvc repro compose_parts")
     if verdict.state != PASSED and verdict.remedy:
-        return CardStep(f"{verdict.remedy.rstrip('.')}; then run it again.", "./run dvc repro")
+        return step(f"{verdict.remedy.rstrip('.')}; then run it again.", "./run dvc repro")
     if real(sources):
-        return CardStep("Compose the commands of a part.", "./run beadline compose PART.gcode")
-    return CardStep("Compose a part of your own.", "./run beadline compose PART.gcode --verify")
+        return step("Compose the commands of a part.", "./run beadline compose PART.gcode")
+    return step("Compose a part of your own.", "./run beadline compose PART.gcode --verify")
 
 
 # ---- the part that decides
 
 
+@or_gap
 def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     """Six seconds of the part on which the composer in use fares worst, about its largest error."""
-    parts, table = structures(sources.evidence), sources.tables["signals"]
-    if isinstance(parts, Missing):
-        return parts
-    if isinstance(table, Missing):
-        return table
+    parts, table = need(structures(sources.evidence)), need(sources.tables["signals"])
     names = shown(verdict.winner or "", parts)
     found = worst(parts, names[0])
     rows = [] if found is None else _stretch(table, found[1], names[0])

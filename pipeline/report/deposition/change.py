@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pipeline.report.shared.difference import Move
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.deposition import NOT_JUDGED, SAME, Structure
-from pipeline.verdict.evidence import lookup
+from pipeline.verdict.evidence import known, lookup
 from pipeline.verdict.verdict import Figure, Missing, Question
 
 
@@ -14,9 +14,7 @@ def moves(sources: Sources, parts: Sequence[Structure]) -> list[Move]:
     """Of every structure and material the flow error of the composer in use. These errors have no bands: one
     simulated print each, the same at every run; so noise is what the choice between composers calls equal.
     """
-    if sources.accepted is None or isinstance(sources.accepted, Missing):
-        return []
-    return [_move(sources, part) for part in parts]
+    return [_move(sources, part) for part in parts] if known(sources.accepted, None) else []
 
 
 def _move(sources: Sources, structure: Structure) -> Move:
@@ -45,8 +43,8 @@ def _move(sources: Sources, structure: Structure) -> Move:
 
 def _accepted(sources: Sources, structure: Structure) -> Figure | None:
     """The error of the composer that was in use then, which may be another one."""
-    parts = lookup(sources.accepted, "metrics.compose_parts")
-    then = {} if isinstance(parts, Missing) else parts.get(structure.part, {}).get(structure.material, {})
+    parts = known(lookup(sources.accepted, "metrics.compose_parts"), {})
+    then = parts.get(structure.part, {}).get(structure.material, {})
     score = then.get(then.get("chosen"))
     return Figure(*3 * (float(score["rms_percent_of_on_off"]),)) if score else None
 

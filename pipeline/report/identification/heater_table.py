@@ -1,14 +1,15 @@
 """What a heater's owner looks for first: gain, time constant and dead time of every pair, a PID beside them,
 and the PID that the printer has."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from pipeline.report.identification.model_errors import MOST_INPUTS
+from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import THIN, band, count, decimals, number, short
-from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.evidence import Table, instead, known, need, need_figure, or_empty
 from pipeline.verdict.verdict import Missing
 
 # Klipper's pid_Kp, pid_Ki and pid_Kd are of a duty of 0 to 255, ours of one in percent
@@ -18,40 +19,17 @@ KLIPPER_FROM_PERCENT = 2.55
 FEW_INPUTS = 4
 
 
-class Banded(NamedTuple):
-    value: str
-    band: str
-
-
-class PairRow(NamedTuple):
-    """K e^(-theta s) / (tau s + 1) of a pair with bands, and its PID. `strongest`: no input moves the output
-    further."""
-
-    input: str
-    strongest: bool
-    gain: Banded
-    tau: Banded
-    delay: Banded
-    Kp: str
-    Ki: Banded
-    Kd: Banded
-
-
-class PidRow(NamedTuple):
-    """A PID of a heater in percent of duty, and as printer.cfg has it."""
-
-    pair: str
-    whose: str
-    gains: list[str]
-    klipper: list[str]
-
-
 def heater_table(sources: Sources) -> dict[str, Any]:
-    """Every pair of the first-order table, output by output; of many inputs the strongest of each output."""
-    table = sources.tables["first_order"]
-    printer, note = _printer_rows(sources, table)
-    if isinstance(table, Missing):
-        return {"finding": "", "outputs": [], "printer": printer, "printer_note": note, "missing": table}
+    """Every pair of the first-order table with a PID beside it, and the PID that the printer has."""
+    printer, note = _printer_rows(sources, sources.tables["first_order"])
+    return {"printer": printer, "printer_note": note} | _pairs(sources)
+
+
+@as_table(finding="", outputs=[])
+def _pairs(sources: Sources) -> dict[str, Any]:
+    """The first-order table, output by output; of many inputs the strongest of each output."""
+    table = need(sources.tables["first_order"])
+
     gaps = _gaps(table, _horizon(sources))
     outputs = [_output_pairs(table, gaps, output.name) for output in sources.declared.machine.outputs]
     fitted = sum(not gap for gap in gaps)
@@ -60,7 +38,7 @@ def heater_table(sources: Sources) -> dict[str, Any]:
         f"{count(fitted, every, every).capitalize()} {'has' if fitted == 1 else 'have'} a gain of known sign "
         "and a time constant that the record shows. Bold: the input that moves an output furthest."
     )
-    return {"finding": finding, "outputs": outputs, "printer": printer, "printer_note": note, "missing": None}
+    return {"finding": finding, "outputs": outputs}
 
 
 def _output_pairs(table: Table, gaps: list[str], output: str) -> dict[str, Any]:
@@ -87,8 +65,7 @@ def shortened_list(names: list[str]) -> str:
 
 def _horizon(sources: Sources) -> float:
     """The longest time after a step that the step responses show, in s."""
-    steps = sources.tables["steps"]
-    return np.inf if isinstance(steps, Missing) else float(steps["time_s"].max())
+    return float(known(sources.tables["steps"], {"time_s": np.array([np.inf])})["time_s"].max())
 
 
 def _gaps(table: Table, horizon: float) -> list[str]:
@@ -101,28 +78,35 @@ def _gaps(table: Table, horizon: float) -> list[str]:
     ]
 
 
-def _pair(table: Table, k: int, strongest: bool) -> PairRow:
-    gain, tau, delay = (_banded(table, key, k) for key in ("gain", "time_constant_s", "delay_s"))
+def _pair(table: Table, k: int, strongest: bool) -> dict[str, Any]:
+    """K e^(-theta s) / (tau s + 1) of a pair with bands, and its PID. `strongest`: no input moves the output
+    further."""
     Kp, Ki, Kd = (float(table[key][k]) for key in ("Kp", "Ki", "Kd"))
-    integral = Banded(short(Ki), f"Ti {short(Kp / Ki, 2)}{THIN}s")
-    derivative = Banded(short(Kd), f"Td {short(Kd / Kp, 2)}{THIN}s")
-    return PairRow(str(table["input"][k]), strongest, gain, tau, delay, short(Kp), integral, derivative)
+    return {
+        "input": str(table["input"][k]),
+        "strongest": strongest,
+        "gain": _banded(table, "gain", k),
+        "tau": _banded(table, "time_constant_s", k),
+        "delay": _banded(table, "delay_s", k),
+        "Kp": short(Kp),
+        "Ki": {"value": short(Ki), "band": f"Ti {short(Kp / Ki, 2)}{THIN}s"},
+        "Kd": {"value": short(Kd), "band": f"Td {short(Kd / Kp, 2)}{THIN}s"},
+    }
 
 
-def _banded(table: Table, key: str, k: int) -> Banded:
+def _banded(table: Table, key: str, k: int) -> dict[str, str]:
     value, low, high = (float(table[f"{key}{end}"][k]) for end in ("", "_low", "_high"))
     places = decimals(low, high, value=value)
-    return Banded(number(value, places), band(low, high, places))
+    return {"value": number(value, places), "band": band(low, high, places)}
 
 
 # ---- the printer's own
 
 
-def _printer_rows(sources: Sources, table: Table | Missing) -> tuple[list[PidRow], str]:
+@instead(lambda gap: ([], ""))
+def _printer_rows(sources: Sources, table: Table | Missing) -> tuple[list[dict[str, Any]], str]:
     """The printer's PID of each heater over the one by SIMC, and how both are to be read."""
-    own = lookup(sources.tables["printer_pid"], "heaters")
-    if isinstance(own, Missing):
-        return [], ""
+    own = need_figure(sources.tables["printer_pid"], "heaters")
     rows = []
     for pid in own:
         pair = f"{pid['input']} to {pid['output']}"
@@ -138,17 +122,17 @@ def _printer_rows(sources: Sources, table: Table | Missing) -> tuple[list[PidRow
     return rows, note
 
 
+@or_empty
 def _simc(table: Table | Missing, pid: dict[str, Any]) -> list[float]:
-    if isinstance(table, Missing):
-        return []
+    table = need(table)
     k = np.flatnonzero((table["output"] == pid["output"]) & (table["input"] == pid["input"]))
     gains = [float(table[key][k[0]]) for key in ("Kp", "Ki", "Kd")] if len(k) else []
     return gains if np.isfinite(gains).all() else []
 
 
-def _pid_row(pair: str, whose: str, gains: list[float]) -> PidRow:
-    if not gains:
-        return PidRow(pair, whose, ["none"] * 3, ["none"] * 3)
-    return PidRow(
-        pair, whose, [short(gain) for gain in gains], [short(gain * KLIPPER_FROM_PERCENT) for gain in gains]
+def _pid_row(pair: str, whose: str, gains: list[float]) -> dict[str, Any]:
+    """A PID of a heater in percent of duty, and as printer.cfg has it."""
+    percent, klipper = (
+        [short(gain * scale) for gain in gains] or ["none"] * 3 for scale in (1, KLIPPER_FROM_PERCENT)
     )
+    return {"pair": pair, "whose": whose, "gains": percent, "klipper": klipper}

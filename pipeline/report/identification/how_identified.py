@@ -2,11 +2,12 @@
 forbids, what was chosen, and every output's fits with and without a free mean."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
+from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import THIN, band, count, decimals, number, short
-from pipeline.verdict.evidence import lookup
+from pipeline.verdict.evidence import Absent, gap_of, instead, lookup, need, need_figure
 from pipeline.verdict.identification import (
     Fit,
     band_of,
@@ -29,26 +30,15 @@ REFINED = {
 # ---- open or closed loop
 
 
-class LoopState(NamedTuple):
-    """Open or closed loop in a word, the test behind it, and what follows; `missing` where it was not
-    tested."""
-
-    closed: bool
-    head: str
-    test: str
-    follows: str
-    missing: Missing | None = None
-
-
-def loop_state(sources: Sources) -> LoopState:
-    """Whether inputs answered what the outputs did, and what follows for the model."""
-    tested = lookup(sources.metrics["identify_plant"], "closed_loop", what="the test for feedback")
-    if isinstance(tested, Missing):
-        return LoopState(False, "", "", "", tested)
+@as_table(closed=False)
+def loop_state(sources: Sources) -> dict[str, Any]:
+    """Whether inputs answered what the outputs did: in a word, the test behind it, and what follows for the
+    model."""
+    tested = need_figure(sources.metrics["identify_plant"], "closed_loop", what="the test for feedback")
     p_values = tested["p_value"]
     if not p_values:
         reason = "the record is noise-free: it holds no errors that an input could answer"
-        return LoopState(False, "", "", "", Missing("not applicable", reason))
+        raise Absent(Missing("not applicable", reason))
     level = tested.get("level", 0.0)
     if tested["closed"]:
         answering = [name for name, p in p_values.items() if p < level] or [min(p_values, key=p_values.get)]
@@ -57,7 +47,8 @@ def loop_state(sources: Sources) -> LoopState:
             f"{_listed(answering)} {'answers' if len(answering) == 1 else 'answer'} past errors of the "
             f"outputs ({_p(largest)}), as a controller does."
         )
-        return LoopState(True, "Recorded in closed loop.", test, _closed_follows(sources))
+        head = "Recorded in closed loop."
+        return {"closed": True, "head": head, "test": test, "follows": _closed_follows(sources)}
     nearest = min(p_values, key=p_values.get)
     threshold = f"; feedback is called below {short(level, 2)}" if level else ""
     test = (
@@ -69,7 +60,7 @@ def loop_state(sources: Sources) -> LoopState:
         "moves stays below this test: where the machine had one, believe the fit some steps ahead before the "
         "simulation."
     )
-    return LoopState(False, "No feedback was recognised.", test, follows)
+    return {"closed": False, "head": "No feedback was recognised.", "test": test, "follows": follows}
 
 
 def _closed_follows(sources: Sources) -> str:
@@ -102,31 +93,21 @@ def _listed(items: Sequence[str]) -> str:
 # ---- gains that physics forbids
 
 
+@as_table(finding="", rows=[])
 def flagged(sources: Sources) -> dict[str, Any]:
     """Gains of heaters with a sign or a size that physics forbids."""
-    gains = lookup(sources.metrics["identify_plant"], "forbidden_gains", what="the check of signs and sizes")
-    if isinstance(gains, Missing):
-        return {"finding": "", "rows": [], "missing": gains}
+    gains = need_figure(
+        sources.metrics["identify_plant"], "forbidden_gains", what="the check of signs and sizes"
+    )
     machine = sources.declared.machine
     heaters = [signal.name for signal in machine.inputs if signal.heats]
     if not heaters:
         reason = "no input is declared to heat, so no sign is known to be wrong"
-        return {
-            "finding": "",
-            "rows": [],
-            "missing": Missing("not applicable", reason, "Set heats: true for heaters in plant.inputs"),
-        }
-    if not gains:
-        return {
-            "finding": f"None: every effect of {_listed(heaters)} is one that a heater can have.",
-            "rows": [],
-            "missing": None,
-        }
-    return {
-        "finding": f"{flagged_sentence(gains)} {flagged_remedy(gains)}",
-        "rows": [_flagged_row(gain) for gain in gains],
-        "missing": None,
-    }
+        raise Absent(Missing("not applicable", reason, "Set heats: true for heaters in plant.inputs"))
+    finding = f"None: every effect of {_listed(heaters)} is one that a heater can have."
+    if gains:
+        finding = f"{flagged_sentence(gains)} {flagged_remedy(gains)}"
+    return {"finding": finding, "rows": [_flagged_row(gain) for gain in gains]}
 
 
 def _flagged_row(gain: dict[str, Any]) -> dict[str, Any]:
@@ -156,7 +137,7 @@ def chosen_rows(sources: Sources) -> list[tuple[str, str]]:
     ]
     disturbances = [signal.name for signal in sources.declared.machine.disturbances]
     return [
-        *((name, value.state if isinstance(value, Missing) else words()) for name, value, words in rows),
+        *((name, gap.state if (gap := gap_of(value)) else words()) for name, value, words in rows),
         ("Measured disturbances", ", ".join(disturbances) or "none declared (plant.disturbances)"),
     ]
 
@@ -178,19 +159,6 @@ def left_out_words(sources: Sources) -> str:
 # ---- fits by output
 
 
-class FitRow(NamedTuple):
-    """An output's fits: simulated as it stands, with its mean free, and ahead, each with its band; what the
-    mean costs, and whether u(t) acts on it at once."""
-
-    name: str
-    simulated: tuple[str, str]
-    free: tuple[str, str]
-    cost: str
-    sure: bool
-    ahead: tuple[str, str]
-    feedthrough: str
-
-
 def fit_table(sources: Sources, fits: Sequence[Fit]) -> dict[str, Any]:
     """Every output with and without a free mean: what another ambient or operating point costs."""
     metrics = sources.metrics["identify_plant"]
@@ -199,34 +167,32 @@ def fit_table(sources: Sources, fits: Sequence[Fit]) -> dict[str, Any]:
         free = fit_figure(metrics, "fit_holdout_free_mean", fit.name)
         direct = lookup(metrics, f"feedthrough.{fit.name}")
         cost, sure = _cost(fit.simulated, free)
-        words = direct.state if isinstance(direct, Missing) else "yes" if direct else "no"
-        rows.append(FitRow(fit.name, _cell(fit.simulated), _cell(free), cost, sure, _cell(fit.ahead), words))
-    moved = [f"{row.cost} in {row.name}" for row in rows if row.sure]
-    measured = any(
-        not isinstance(fit_figure(metrics, "fit_holdout_free_mean", fit.name), Missing) for fit in fits
-    )
+        cells = {
+            key: (percent_of(value), band_of(value))
+            for key, value in (("simulated", fit.simulated), ("free", free), ("ahead", fit.ahead))
+        }
+        words = gap.state if (gap := gap_of(direct)) else "yes" if direct else "no"
+        rows.append(
+            {"name": fit.name, "cost": cost, "sure": sure, "known": not gap_of(free), "feedthrough": words}
+            | cells
+        )
+    moved = [f"{row['cost']} in {row['name']}" for row in rows if row["sure"]]
     if moved:
         finding = (
             f"A free mean gains {_listed(moved)}: the level moved up to the hold-out, as another ambient or "
             "operating point moves it. Record what does so as one of plant.disturbances."
         )
-    elif measured:
+    elif any(row["known"] for row in rows):
         finding = "A free mean gains nothing beyond noise: the level did not move up to the hold-out."
     else:
         finding = ""
     return {"finding": finding, "rows": rows}
 
 
+@instead(lambda gap: ("not measured", False))
 def _cost(simulated: Figure | Missing, free: Figure | Missing) -> tuple[str, bool]:
     """Points that a free mean gains, and whether the bands are apart."""
-    if isinstance(simulated, Missing) or isinstance(free, Missing):
-        return "not measured", False
+    simulated, free = need(simulated), need(free)
     if free.low <= simulated.high:
         return "within noise", False
     return f"{number(free.value - simulated.value, 1)} points", True
-
-
-def _cell(fit: Figure | Missing) -> tuple[str, str]:
-    if isinstance(fit, Missing):
-        return fit.state, ""
-    return percent_of(fit), band_of(fit)

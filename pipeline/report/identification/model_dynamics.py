@@ -2,20 +2,19 @@
 excitation that it was learned from."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.identification.how_identified import left_out_words, loop_state
-from pipeline.report.identification.model_errors import Room, blank, matrix, room
+from pipeline.report.identification.model_errors import Room, as_matrix, matrix, room
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import evidence
 from pipeline.verdict.digits import DASH, THIN, band, count, decimals, number, short
-from pipeline.verdict.evidence import Table, lookup
-from pipeline.verdict.verdict import Missing
+from pipeline.verdict.evidence import Table, entry, known, lookup, need, need_figure, or_empty
 
 MOST_DOTS = 600  # of the cloud of poles
 
@@ -23,17 +22,11 @@ MOST_DOTS = 600  # of the cloud of poles
 # ---- step responses
 
 
+@as_matrix("steps", "What each input does: step responses")
 def steps(sources: Sources) -> dict[str, Any]:
     """Response of each output to a step of each input, with the
     spread's band, and gain, time constant and delay."""
-    table, dynamics, title = (
-        sources.tables["steps"],
-        sources.tables["dynamics"],
-        "What each input does: step responses",
-    )
-    gap = next((part for part in (table, dynamics) if isinstance(part, Missing)), None)
-    if gap:
-        return blank("steps", title, gap)
+    table, dynamics = need(sources.tables["steps"]), need(sources.tables["dynamics"])
     size = room(len(sources.declared.machine.inputs))
     scales = {o.name: _reach(table, table["output"] == o.name) for o in sources.declared.machine.outputs}
 
@@ -63,24 +56,14 @@ def steps(sources: Sources) -> dict[str, Any]:
         f"cut where it leaves the panel. τ: 1.5 times the way from 28.3 to 63.2{THIN}% of the largest "
         f"excursion; delay: what is left of the time to 63.2{THIN}%.{more}"
     )
-    return {
-        "id": "steps",
-        "title": title,
-        "finding": text,
-        "rows": rows,
-        "caption": caption,
-        "origin": page.origin(sources.source("steps", "dynamics"), y="response"),
-        "across": size.across,
-        "missing": None,
-    }
+    origin = page.origin(sources.source("steps", "dynamics"), y="response")
+    return {"finding": text, "rows": rows, "caption": caption, "origin": origin, "across": size.across}
 
 
 def _members(sources: Sources) -> str:
-    poles = sources.tables["poles"]
+    poles = known(sources.tables["poles"], None)
     return (
-        "the plants of the spread"
-        if isinstance(poles, Missing)
-        else count(int(poles["member"].max()), "plant") + " of the spread"
+        f"{count(int(poles['member'].max()), 'plant')} of the spread" if poles else "the plants of the spread"
     )
 
 
@@ -152,19 +135,16 @@ def _span(values: tuple[float, float, float]) -> str:
 # ---- order and poles
 
 
+@as_picture("order", "How many states the record asks for")
 def order(sources: Sources) -> Picture:
     """Singular values and the error of each order."""
-    shown = [evidence.singular(sources), evidence.left_out(sources)]
-    table, title = sources.tables["order"], "How many states the record asks for"
-    if isinstance(table, Missing):
-        return placeholder("order", title, table)
+    table = need(sources.tables["order"])
+    shown = [evidence.singular(table), evidence.left_out(table)]
     chosen = int(table["order"][table["chosen"]][0]) if table["chosen"].any() else 0
     given = sources.declared.everything.get("identify_plant", {}).get("order") or 0
-    tried, tolerance = (
-        np.isfinite(table["error"]).any(),
-        lookup(sources.metrics["identify_plant"], "order_tolerance_percent"),
-    )
-    near = "near the best" if isinstance(tolerance, Missing) else f"within {tolerance:g}{THIN}% of the best"
+    tried = np.isfinite(table["error"]).any()
+    tolerance = entry(sources.metrics["identify_plant"], "order_tolerance_percent")
+    near = "near the best" if tolerance is None else f"within {tolerance:g}{THIN}% of the best"
     if given:
         text = f"Order {chosen}, as identify_plant.order asks; the data were not asked."
     elif tried:
@@ -175,25 +155,17 @@ def order(sources: Sources) -> Picture:
     caption = (
         f"The rule: orders whose singular value rises above what noise alone reaches, {edge}, are tried; "
         f"each is identified with {left_out_words(sources)} and simulated on it"
-        f"{', and predicted one step ahead' if loop_state(sources).closed else ''}. "
+        f"{', and predicted one step ahead' if loop_state(sources)['closed'] else ''}. "
         f"Of those whose error is {near}, the one with the fewest free numbers wins. "
         "Window, feed-through, order and refinement were chosen together."
     )
-    return Picture(
-        "order",
-        title,
-        text,
-        [PictureColumn(c.head, c.small, "", c.panels) for c in shown],
-        caption if tried else "",
-        page.origin(sources.source("order")),
-    )
+    return Picture(text, shown, caption if tried else "", page.origin(sources.source("order")))
 
 
+@as_picture("poles", "Poles, and how surely they are known")
 def poles(sources: Sources) -> Picture:
     """Poles of the model with the spread's cloud: the whole circle, and where they crowd."""
-    table, title = sources.tables["poles"], "Poles, and how surely they are known"
-    if isinstance(table, Missing):
-        return placeholder("poles", title, table)
+    table = need(sources.tables["poles"])
     mine = table["member"] == 0
     others = np.flatnonzero(~mine)[:: max(1, -(-int((~mine).sum()) // MOST_DOTS))]
     of_mine, extra = others[table["pole"][others] >= 0], others[table["pole"][others] < 0]
@@ -218,12 +190,12 @@ def poles(sources: Sources) -> Picture:
             )
         )
         layers = (
-            [charts.line(frame, np.cos(_CIRCLE), np.sin(_CIRCLE), "lim line thin", most=len(_CIRCLE))]
+            [charts.line(frame, *charts.CIRCLE, "lim line thin", most=charts.CIRCLE.shape[1])]
             if not near
             else [_arc(frame)]
         )
         layers += [
-            charts.dots(frame, *_inside(frame, real[part], imag[part]), css, 1.7)
+            charts.dots(frame, *charts.inside(frame, real[part], imag[part]), css, 1.7)
             for part, css in ((extra, "try pale"), (of_mine, "try"))
         ]
         layers.append(charts.crosses(frame, real[mine], imag[mine]))
@@ -247,15 +219,7 @@ def poles(sources: Sources) -> Picture:
             f" Bandwidth by singular values: {short(bandwidth, 3)} rad/s, a time constant of "
             f"{short(1 / bandwidth, 3)} s."
         )
-    return Picture("poles", title, text, shown, caption, page.origin(sources.source("poles")))
-
-
-_CIRCLE = np.linspace(0, 2 * np.pi, 181)
-
-
-def _inside(frame: charts.Frame, real: np.ndarray, imag: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    inside = (real >= frame.x.low) & (real <= frame.x.high) & (imag >= frame.y.low) & (imag <= frame.y.high)
-    return real[inside], imag[inside]
+    return Picture(text, shown, caption, page.origin(sources.source("poles")))
 
 
 def _window(real: np.ndarray, imag: np.ndarray, shown: np.ndarray) -> charts.Frame:
@@ -283,22 +247,11 @@ def _arc(frame: charts.Frame) -> Markup:
     return charts.line(frame, np.cos(angle), np.where(inside, np.sin(angle), np.nan), "lim line thin")
 
 
-class PoleRow(NamedTuple):
-    """A pole, or a pair: size, time constant with its band over the spread, period."""
-
-    size: str
-    pair: str
-    constant: str
-    band: str
-    period: str
-
-
-def pole_table(sources: Sources) -> list[PoleRow]:
+@or_empty
+def pole_table(sources: Sources) -> list[dict[str, str]]:
     """Each pole of the model, a pair in one row: size, time constant
     with its band over the spread, period."""
-    table, step = sources.tables["poles"], sources.declared.machine.sample_time_s
-    if isinstance(table, Missing):
-        return []
+    table, step = need(sources.tables["poles"]), sources.declared.machine.sample_time_s
     rows = []
     for k in np.flatnonzero((table["member"] == 0) & (table["imag"] >= 0)):
         value = complex(table["real"][k], table["imag"][k])
@@ -312,19 +265,19 @@ def pole_table(sources: Sources) -> list[PoleRow]:
         )
         again = low <= constant <= high
         rows.append(
-            PoleRow(
-                size=number(abs(value), 4),
-                pair="pair" if value.imag else "",
-                constant=f"{short(constant, 3)}{THIN}s" if np.isfinite(constant) else "none",
-                band=""
+            {
+                "size": number(abs(value), 4),
+                "pair": "pair" if value.imag else "",
+                "constant": f"{short(constant, 3)}{THIN}s" if np.isfinite(constant) else "none",
+                "band": ""
                 if np.isnan(low + high)
                 else f"{short(low, 3)}{DASH}{short(high, 3)}"
                 if again
                 else "not found again",
-                period=f"{short(2 * np.pi * step / abs(np.angle(value)), 3)}{THIN}s"
+                "period": f"{short(2 * np.pi * step / abs(np.angle(value)), 3)}{THIN}s"
                 if value.imag or value.real < 0
                 else "",
-            )
+            }
         )
     return rows
 
@@ -337,13 +290,13 @@ def _constant(size: float, step: float) -> float:
 # ---- excitation
 
 
+@as_picture("excitation", "How well the record excites the machine")
 def excitation(sources: Sources) -> Picture:
     """How strongly the record moved each input, by frequency."""
-    table, title = sources.tables["levels"], "How well the record excites the machine"
-    excited = lookup(sources.metrics["identify_plant"], "excitation")
-    gap = next((part for part in (table, excited) if isinstance(part, Missing)), None)
-    if gap:
-        return placeholder("excitation", title, gap)
+    table, excited = (
+        need(sources.tables["levels"]),
+        need_figure(sources.metrics["identify_plant"], "excitation"),
+    )
     y, shown = charts.linear(0, 1.1 * float(table["level"].max()) or 1.0, ticks=3), []
     size = room(len(sources.declared.machine.inputs))
     for signal in sources.declared.machine.inputs:
@@ -389,8 +342,6 @@ def excitation(sources: Sources) -> Picture:
         )
     )
     return Picture(
-        "excitation",
-        title,
         text,
         shown,
         "R.m.s. level in per cent within eight equal bands of frequency, 0 to π rad a sample.",

@@ -8,12 +8,11 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import THIN, count, number, short
-from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.evidence import Table, lookup, need
 from pipeline.verdict.identification import Fit, percent_of
-from pipeline.verdict.verdict import Missing
 
 MOST_INPUTS = 7  # panels in a row of a matrix; a machine with more shows the strongest
 
@@ -38,36 +37,25 @@ def room(panels: int) -> Room:
     return Room(across, width, height, "mb wide" if across < 6 else "mb")
 
 
-def blank(id: str, title: str, missing: Missing) -> dict[str, Any]:
-    return {
-        "id": id,
-        "title": title,
-        "finding": "",
-        "rows": [],
-        "caption": "",
-        "origin": Markup(""),
-        "across": 0,
-        "missing": missing,
-    }
+def as_matrix(id: str, title: str) -> Callable[[Callable[..., dict]], Callable[..., dict]]:
+    """A decorator: a matrix of panels with its id and title; if it needs something that is absent, the
+    reason."""
+    empty = {"finding": "", "rows": [], "caption": "", "origin": Markup(""), "across": 0}
+    named = {"id": id, "title": title}
+    return lambda draw: lambda sources: named | as_table(**empty)(draw)(sources)
 
 
 # ---- the hold-out
 
 
+@as_picture("holdout", "Measured against simulated, on the part of the record that the model did not see")
 def holdout(sources: Sources, fits: Sequence[Fit], ahead: str) -> Picture:
     """Every output of the hold-out: measured, simulated, and predicted so many steps ahead."""
-    table, title = (
-        sources.tables["holdout"],
-        "Measured against simulated, on the part of the record that the model did not see",
-    )
-    if isinstance(table, Missing):
-        return placeholder("holdout", title, table)
+    table = need(sources.tables["holdout"])
     shown, points = [], max(60, 240 * 10 // max(len(fits), 10))
     for fit in fits:
         parts = [("simulated", fit.simulated), (ahead, fit.ahead)]
-        small = ", ".join(
-            f"{name} {part.state if isinstance(part, Missing) else percent_of(part)}" for name, part in parts
-        )
+        small = ", ".join(f"{name} {percent_of(part)}" for name, part in parts)
         shown.append(
             PictureColumn(fit.name, f"fit: {small}", "", _stretch(sources, table, fit.name, small, points))
         )
@@ -89,7 +77,7 @@ def holdout(sources: Sources, fits: Sequence[Fit], ahead: str) -> Picture:
         f"Below, measured less predicted: ink simulated, grey {ahead}. Vermillion: masked. Upright lines: "
         "where a stretch ends."
     )
-    return Picture("holdout", title, text, shown, caption, page.origin(sources.source("holdout")))
+    return Picture(text, shown, caption, page.origin(sources.source("holdout")))
 
 
 def _stretch(sources: Sources, table: Table, name: str, small: str, points: int) -> list[Markup]:
@@ -155,11 +143,10 @@ def _stretch(sources: Sources, table: Table, name: str, small: str, points: int)
 # ---- residuals
 
 
+@as_picture("white", "What the model leaves over: is it noise?")
 def whiteness(sources: Sources) -> Picture:
     """Autocorrelation of the one-step errors of each output, with its 99 % band."""
-    table, title = sources.tables["residuals"], "What the model leaves over: is it noise?"
-    if isinstance(table, Missing):
-        return placeholder("white", title, table)
+    table = need(sources.tables["residuals"])
     names = [output.name for output in sources.declared.machine.outputs]
     mine = {
         name: (table["output"] == name) & (table["against"] == name) & (table["lag"] > 0) for name in names
@@ -182,14 +169,13 @@ def whiteness(sources: Sources) -> Picture:
         f"99{THIN}% band; one lag in a hundred may leave it by chance. Vermillion: lags outside where the "
         "test failed."
     )
-    return Picture("white", title, text, shown, caption, page.origin(sources.source("residuals")))
+    return Picture(text, shown, caption, page.origin(sources.source("residuals")))
 
 
+@as_matrix("followed", "Do the errors still follow an input?")
 def cross(sources: Sources) -> dict[str, Any]:
     """Correlation of each output's one-step errors with each input."""
-    table, title = sources.tables["residuals"], "Do the errors still follow an input?"
-    if isinstance(table, Missing):
-        return blank("followed", title, table)
+    table = need(sources.tables["residuals"])
     other, size = table["against"] != table["output"], room(len(sources.declared.machine.inputs))
     y = _correlations(table, other)
     strength = np.nan_to_num(np.abs(table["correlation"]) / np.maximum(table["band"], 1e-300))
@@ -235,16 +221,8 @@ def cross(sources: Sources) -> dict[str, Any]:
         "the test widens it for the number of lags. Left of zero, pale: feedback from errors to inputs, "
         f"no fault of the model.{more}"
     )
-    return {
-        "id": "followed",
-        "title": title,
-        "finding": text,
-        "rows": rows,
-        "caption": caption,
-        "origin": page.origin(sources.source("residuals")),
-        "across": size.across,
-        "missing": None,
-    }
+    origin = page.origin(sources.source("residuals"))
+    return {"finding": text, "rows": rows, "caption": caption, "origin": origin, "across": size.across}
 
 
 def _correlations(table: Table, rows: np.ndarray) -> charts.Axis:

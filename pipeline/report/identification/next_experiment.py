@@ -4,25 +4,20 @@ and what it would teach."""
 from collections.abc import Mapping
 from typing import Any
 
+from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import THIN, number, short
-from pipeline.verdict.evidence import lookup
-from pipeline.verdict.verdict import Missing
+from pipeline.verdict.evidence import need_figure
 
 
+@as_table(sentences=[], rows=[])
 def next_experiment(sources: Sources) -> dict[str, Any]:
     """Of the stage generate_probing."""
     metrics = sources.metrics["generate_probing"]
-    told, added = lookup(metrics, "next_experiment"), lookup(metrics, "closed_loop")
-    for part in (told, added):
-        if isinstance(part, Missing):
-            return {"missing": part, "sentences": [], "rows": []}
+    told, added = need_figure(metrics, "next_experiment"), need_figure(metrics, "closed_loop")
     if not told["written"]:
-        return {
-            "missing": None,
-            "sentences": [f"No experiment is written: {_celsius(told['reason'])}.", _around(added)],
-            "rows": [],
-        }
+        why = f"No experiment is written: {_celsius(told['reason'])}."
+        return {"sentences": [why, _around(added)], "rows": []}
     rows = [
         {
             "output": output.name,
@@ -33,16 +28,16 @@ def next_experiment(sources: Sources) -> dict[str, Any]:
         for output in sources.declared.machine.outputs
         if output.name in told["limit_degC"]
     ]
-    return {"missing": None, "sentences": [_played(told), _taught(told), _around(added)], "rows": rows}
+    return {"sentences": [_played(told), _taught(told), _around(added)], "rows": rows}
 
 
 def _played(told: Mapping[str, Any]) -> str:
     least, most = (pick(told["amplitude_percent"].values()) for pick in (min, max))
     moves = short(most, 2) if least == most else f"{short(least, 2)} to {short(most, 2)}"
-    doubt = lookup(told, "doubt")
+    doubt = told.get("doubt")
     doubted = (
         ""
-        if isinstance(doubt, Missing)
+        if doubt is None
         else f", though input gains be wrong by {100 * doubt['input_gain']:g}{THIN}% and the ambient by "
         f"{doubt['ambient_degC']:g}{THIN}°C"
     )

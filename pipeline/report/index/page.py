@@ -15,7 +15,8 @@ from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import card as temperature_card
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.twelve import drift_state
-from pipeline.verdict.verdict import FAILED, PASSED, Missing, Verdict
+from pipeline.verdict.evidence import need, or_no_entries
+from pipeline.verdict.verdict import FAILED, PASSED, Verdict
 
 
 def render(sources: Sources, judged: Judgement) -> str:
@@ -58,11 +59,10 @@ def drifts(judged: Judgement) -> str:
     return f"Drift: temperature {word[:1].lower()}{word[1:].rstrip('.')}, not measured in the others."
 
 
+@or_no_entries
 def files(sources: Sources, verdict: Verdict) -> dict[str, dict[str, Any]]:
     """{loop: what leaves the house}; {} if nothing was exported."""
-    lines = exported.lines(sources, verdict)
-    if isinstance(lines, Missing):
-        return {}
+    lines = need(exported.lines(sources, verdict))
     return {
         line.loop: {
             "path": line.file,

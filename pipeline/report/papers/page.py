@@ -15,6 +15,7 @@ from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS, Pap
 from pipeline.report.shared import page
 from pipeline.report.shared.sources import Sources
 from pipeline.store import artifacts
+from pipeline.verdict.evidence import gap_of
 from pipeline.verdict.verdict import Missing
 
 # glyph of a verdict, by the states that the pages know
@@ -34,8 +35,8 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
     shown, gaps = [], []
     for key, (printed, results) in files.items():
         paper = read(printed, results, sources.metrics)
-        if isinstance(paper, Missing):
-            gaps.append((key, paper))
+        if gap := gap_of(paper):
+            gaps.append((key, gap))
             continue
         pictures = PICTURES[key](paper.results, sources)
         shown.append(

@@ -5,13 +5,14 @@ from typing import Any
 
 from pipeline.verdict.controllers import in_a_sentence
 from pipeline.verdict.digits import count, number
+from pipeline.verdict.evidence import instead, need
 from pipeline.verdict.verdict import Missing
 
 
+@instead(lambda gap: [gap.sentence()])
 def sentences(results: Mapping[str, Any] | Missing) -> list[str]:
     """How often each controller was the best and won the pair, and which pair a changed prior gives."""
-    if isinstance(results, Missing):
-        return [results.sentence()]
+    results = need(results)
     answers = results["answers"]
     told = [
         f"{count(results['relearnings'], 'fresh record')} of the bundled simulated machine, each learned and "

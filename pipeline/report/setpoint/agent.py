@@ -10,12 +10,12 @@ from markupsafe import Markup
 
 from pipeline.papers import made
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, PHASES, ROTATION
 from pipeline.verdict.digits import THIN, number, percent, quantity
-from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.evidence import Absent, Table, instead, need, need_figure, or_empty, or_gap
 from pipeline.verdict.setpoint import Board, Case, case_text, role
 from pipeline.verdict.verdict import Missing
 
@@ -48,26 +48,18 @@ def shown(board: Board, table: Table, case: Case) -> list[str]:
     return [name for name in dict.fromkeys(names) if name in in_paths]
 
 
+@instead(lambda gap: [placeholder("ways", "From 21 starts to the best setpoint", gap)])
 def ways(sources: Sources, board: Board | Missing) -> list[Picture]:
     """For each simulator whose ways were kept, everybody's ways over
     the reward and their flow step by step."""
-    table, title = sources.tables["paths"], "From 21 starts to the best setpoint"
-    for needed in (board, table):
-        if isinstance(needed, Missing):
-            return [placeholder("ways", title, needed)]
+    board, table = need(board), need(sources.tables["paths"])
     run = list(
         pd.DataFrame(table)[["simulator", "case"]].drop_duplicates().itertuples(index=False, name=None)
     )
     wanted = (*CASES, *(case for case in run if case[0] == "pixels"))
     cases = [case for case in wanted if case in run][:3] or run[:1]
     if not cases:
-        return [
-            placeholder(
-                "ways",
-                title,
-                Missing("not measured", "no way was kept", "Run ./run dvc repro evaluate_setpoint"),
-            )
-        ]
+        raise Absent(Missing("not measured", "no way was kept", "Run ./run dvc repro evaluate_setpoint"))
     return [_ways(sources, board, table, case, i) for i, case in enumerate(cases)]
 
 
@@ -89,8 +81,6 @@ def _ways(sources: Sources, board: Board, table: Table, case: Case, i: int) -> P
         )
     where = case_text(case, whole=True)
     return Picture(
-        f"ways-{i}",
-        f"{where}: from 21 starts to the best setpoint",
         f"Inside by decision {SETTLED_BY} and to the end: {'; '.join(sentences)}.",
         columns,
         "One run from each start. Above: temperature against true flow, over the paper’s reward with a, "
@@ -101,6 +91,8 @@ def _ways(sources: Sources, board: Board, table: Table, case: Case, i: int) -> P
         page.origin(
             sources.source("paths"), simulator=case[0], case=case[1], controller=shown(board, table, case)
         ),
+        f"ways-{i}",
+        f"{where}: from 21 starts to the best setpoint",
     )
 
 
@@ -211,16 +203,13 @@ def _steps(name: str, flow: list[np.ndarray], inside: list[np.ndarray], css: str
 # ---- what the agents learned
 
 
+@as_picture("agents", "The paper’s agent in training, phase after phase")
 def training(sources: Sources) -> Picture:
     """Mean reward while the paper's agent learns, phase after phase (figure 6 of the paper)."""
-    table, title = sources.tables["agents"], "The paper’s agent in training, phase after phase"
-    if isinstance(table, Missing):
-        return placeholder("agents", title, table)
+    table = need(sources.tables["agents"])
     course = pd.DataFrame(table)
     values = ", ".join(number(end, 2) for end in course.groupby("phase").reward.last().tolist())
     return Picture(
-        "agents",
-        title,
         f"Its phases end at a mean reward of {values}.",
         [PictureColumn("The paper’s agent", "as published", "data_driven", [_course(course, values)])],
         "Mean reward of a step, in the reward of its phase, against thousands of updates: "
@@ -264,30 +253,30 @@ def kept_sentence() -> str:
     return f"All pages show one agent, which no recording changes. {kept}{anew}"
 
 
+@as_table()
 def phases(sources: Sources) -> dict[str, Any]:
     """What training came to: settled, staying and steps, by what was trained."""
-    metrics = sources.metrics["train_agent"]
-    if isinstance(metrics, Missing):
-        return {"missing": metrics}
+    metrics = need(sources.metrics["train_agent"])
     rows = []
     for name, (head, small) in TAUGHT.items():
         figures = metrics.get(name)
         if not isinstance(figures, dict):
             continue
-        steps, runs, stay = (lookup(figures, key) for key in ("median_steps", "runs", "stay"))
+        steps, runs, stay = (figures.get(key) for key in ("median_steps", "runs", "stay"))
         rows.append(
             {
                 "name": head,
                 "small": small,
                 "mark": "data_driven",
                 "settled": percent(float(figures["settled"]), 3),
-                "stay": "not measured" if isinstance(stay, Missing) else percent(float(stay), 3),
-                "steps": "none settled" if isinstance(steps, Missing) else number(float(steps), 0),
-                "runs": "not said" if isinstance(runs, Missing) else f"{runs:,}",
+                "stay": "not measured" if stay is None else percent(float(stay), 3),
+                "steps": "none settled" if steps is None else number(float(steps), 0),
+                "runs": "not said" if runs is None else f"{runs:,}",
             }
         )
-    gap = None if rows else Missing("not measured", "figures.json of train_agent holds no run")
-    return {"missing": gap, "rows": rows}
+    if not rows:
+        raise Absent(Missing("not measured", "figures.json of train_agent holds no run"))
+    return {"rows": rows}
 
 
 # ---- what the paper claims of its agent, and what it does not print
@@ -304,11 +293,10 @@ CLAIMED = {
 RANGES = ("flow_range", "temperature_range")
 
 
+@or_gap
 def claims(sources: Sources) -> list[dict[str, Any]] | Missing:
     """What Li and Pattinson (2025) tell of single starts beside our agent trained as they say."""
-    found = lookup(sources.metrics["train_agent"], "claims")
-    if isinstance(found, Missing):
-        return found
+    found = need_figure(sources.metrics["train_agent"], "claims")
     rows = []
     for start, pair in found.items():
         printed, measured = pair.get("printed") or {}, pair.get("measured") or {}
@@ -344,11 +332,10 @@ GUESSED = {
 }
 
 
+@or_empty
 def guesses(sources: Sources) -> list[tuple[str, str]]:
     """What the paper does not print and we set; [] where nothing was trained."""
-    found = lookup(sources.metrics["train_agent"], "guesses")
-    if isinstance(found, Missing):
-        return []
+    found = need_figure(sources.metrics["train_agent"], "guesses")
     return [(GUESSED.get(name, str(name)), _plain(value)) for name, value in found.items()]
 
 

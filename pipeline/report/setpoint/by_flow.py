@@ -10,7 +10,7 @@ from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import THIN, band, number, quantity
-from pipeline.verdict.evidence import lookup
+from pipeline.verdict.evidence import Absent, instead, known, lookup, need_figure
 from pipeline.verdict.setpoint import CLASS_BORDERS, share_in
 from pipeline.verdict.verdict import Figure, Missing
 
@@ -40,11 +40,9 @@ class Bin(NamedTuple):
     beside: bool
 
 
-def bins(metrics: Mapping | Missing) -> list[Bin] | Missing:
+def bins(metrics: Mapping | Missing) -> list[Bin]:
     """Of train_classifier.json, the bin that is right least often first."""
-    found = lookup(metrics, "by_flow")
-    if isinstance(found, Missing):
-        return found
+    found = need_figure(metrics, "by_flow")
     rendered = lookup(metrics, "source") == "simulated"
     rows = [
         Bin(
@@ -59,19 +57,20 @@ def bins(metrics: Mapping | Missing) -> list[Bin] | Missing:
         if (figure := share_in(row)) is not None
     ]
     rows.sort(key=lambda row: row.right.value)
-    return rows or Missing("not measured", "no bin of flow holds a window")
+    if not rows:
+        raise Absent(Missing("not measured", "no bin of flow holds a window"))
+    return rows
 
 
 def place(row: Bin) -> str:
     return f"{row.low:g}–{row.high:g}{THIN}%"
 
 
+@instead(lambda gap: {"picture": placeholder("by-flow", TITLE, gap), "rows": (), "ideal": False})
 def by_flow(sources: Sources) -> dict[str, Any]:
     """The chart, and its bins as a table, the worst first."""
     metrics = sources.metrics["train_classifier"]
-    found = metrics if isinstance(metrics, Missing) else bins(metrics)
-    if isinstance(found, Missing):
-        return {"picture": placeholder("by-flow", TITLE, found), "rows": (), "ideal": False}
+    found = bins(metrics)
     ideal = any(row.ideal == row.ideal for row in found)
     rows = [
         {
@@ -95,12 +94,12 @@ def by_flow(sources: Sources) -> dict[str, Any]:
             f"segment carries a width bias of {WIDTH_BIAS:g}{THIN}%, which no picture tells from flow."
         )
     picture = Picture(
-        "by-flow",
-        TITLE,
-        finding(found, lookup(metrics, "right_70_150")),
+        finding(found, known(lookup(metrics, "right_70_150"), None)),
         [PictureColumn("Windows named rightly", "in per cent, by true flow", "", [_chart(found)])],
         caption,
         page.origin(sources.source("train_classifier")),
+        "by-flow",
+        TITLE,
     )
     return {"picture": picture, "rows": rows, "ideal": ideal}
 
@@ -111,7 +110,7 @@ def finding(rows: Sequence[Bin], every: Any) -> str:
     away = [row for row in rows if not row.beside]
     if rows[0].beside and away:
         text += " It lies beside a border of the classes. " + _worst("Worst away from the borders: ", away[0])
-    if not isinstance(every, Missing) and (share := share_in(every)):
+    if share := share_in(every):
         text += (
             f" Were every flow from 70 to 150{THIN}% as frequent: {quantity(share.value, '%', 1)} "
             f"({band(share.low, share.high, 1)})"

@@ -3,9 +3,9 @@
 from pipeline.report.shared.difference import Change
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import MINUS, THIN, number
-from pipeline.verdict.evidence import lookup
+from pipeline.verdict.evidence import entry, gap_of, known, lookup
 from pipeline.verdict.setpoint import Case, Cell, board, within
-from pipeline.verdict.verdict import FAILED, Missing, Question, state
+from pipeline.verdict.verdict import FAILED, Figure, Question, state
 
 # points closer than this are one: the accepted figures are kept rounded
 SAME = 0.05
@@ -14,17 +14,10 @@ SAME = 0.05
 def change(sources: Sources, case: Case, cell: Cell | None) -> Change:
     """How the settled runs of the default moved since the accepted run: beyond noise where the
     interval of the one and as wide a one about the other do not overlap."""
-    if (
-        sources.accepted is None
-        or isinstance(sources.accepted, Missing)
-        or cell is None
-        or isinstance(cell.settled, Missing)
-    ):
+    if not known(sources.accepted, None) or cell is None or not isinstance(cell.settled, Figure):
         return Change("first run")
     stage = lookup(sources.accepted, "metrics.evaluate_setpoint")
-    name = None if isinstance(stage, Missing) else stage.get("default")
-    cases = {} if not name or not isinstance(stage.get(name), dict) else stage[name]
-    before = cases.get(case[0], {}).get(case[1], {}).get("settled")
+    before = entry(stage, str(entry(stage, "default")), *case, "settled")
     if before is None:
         return Change("new")
     now = cell.settled
@@ -45,7 +38,7 @@ def change(sources: Sources, case: Case, cell: Cell | None) -> Change:
 def changes(sources: Sources) -> list[tuple[str, Change]]:
     """Every case of the default that counts, with how its settled runs moved."""
     scores = board(sources.evidence, sources.subject("setpoint"))
-    if isinstance(scores, Missing) or not scores.default:
+    if gap_of(scores) or not scores.default:
         return []
     counting = scores.counting(scores.default)
     return [(within(case), change(sources, case, cell)) for case, cell in counting]

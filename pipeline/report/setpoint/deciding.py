@@ -9,13 +9,13 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.card import PICTURE
-from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND
 from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 from pipeline.verdict.digits import THIN, count, number, shortened
-from pipeline.verdict.evidence import Table
+from pipeline.verdict.evidence import Absent, Table, need, or_gap
 from pipeline.verdict.setpoint import Board, Case, case_text, role, worst
 from pipeline.verdict.verdict import Missing
 
@@ -89,10 +89,10 @@ def clog(table: Table, case: Case) -> Clog | None:
     return Clog(int(moved[0]) + 1, 100.0 * float(np.median(left[:, moved[0]])))
 
 
+@or_gap
 def traces(table: Table | Missing, case: Case, names: Sequence[str]) -> Traces | Missing:
     """The runs of these controllers in this case, of the first of them at least; why there are none."""
-    if isinstance(table, Missing):
-        return table
+    table = need(table)
     kept = {name: trace(table, case, name) for name in names}
     found = {name: one for name, one in kept.items() if one is not None}
     if names[0] not in found:
@@ -107,23 +107,19 @@ def shown(board: Board) -> list[str]:
     return list(dict.fromkeys((board.default, *others[:1], DOES_NOTHING)))
 
 
+@as_picture("deciding", TITLE)
 def picture(sources: Sources, board: Board | Missing) -> Picture:
     """Flow against decisions in the default's worst case, and the share of the runs that are inside."""
-    if isinstance(board, Missing):
-        return placeholder("deciding", TITLE, board)
+    board = need(board)
     _, case = worst(board, board.default, "lasting")
     if case is None:
-        return placeholder("deciding", TITLE, Missing("not measured", "no controller was chosen"))
-    found = traces(sources.tables["paths"], case, shown(board))
-    if isinstance(found, Missing):
-        return placeholder("deciding", TITLE, found)
+        raise Absent(Missing("not measured", "no controller was chosen"))
+    found = need(traces(sources.tables["paths"], case, shown(board)))
     told = finding(found)
     flow = _flow(board, found, charts.Frame(_decisions(found), FLOW, *SIZE), alt=told)
     share = _inside(board, found, sources.declared.rules.settled_percent)
     starts = count(len(found.runs[board.default].flow), "start")
     return Picture(
-        "deciding",
-        case_text(case, whole=True),
         told,
         [
             PictureColumn("Flow", "per cent, against decisions", "", [flow]),
@@ -134,14 +130,14 @@ def picture(sources: Sources, board: Board | Missing) -> Picture:
         f"{BEST_TEMPERATURE:g}{THIN}±{THIN}{TEMPERATURE_BAND:g}{THIN}°C. What lies beyond the axis is not "
         "drawn.",
         page.origin(sources.source("paths"), simulator=case[0], case=case[1], controller=list(found.runs)),
+        title=case_text(case, whole=True),
     )
 
 
+@or_gap
 def panel(sources: Sources, board: Board, case: Case, names: Sequence[str]) -> Markup | Missing:
     """The flow of these controllers in a case, as page one draws it; why there is none."""
-    found = traces(sources.tables["paths"], case, names)
-    if isinstance(found, Missing):
-        return found
+    found = need(traces(sources.tables["paths"], case, names))
     frame = charts.Frame(_decisions(found), FLOW, *PICTURE, 34, 34, 16, 14)
     return _flow(board, found, frame, alt=finding(found), page_one=True)
 

@@ -12,6 +12,7 @@ from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import BEYOND, CLOG_STEP, SETTLED_BY, STEPS
 from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.verdict.digits import THIN, band, number
+from pipeline.verdict.evidence import Absent, instead, need
 from pipeline.verdict.setpoint import Board, Case, Harm, bars, case_text, harm_of, role, share_text
 from pipeline.verdict.verdict import Figure, Missing
 
@@ -22,16 +23,16 @@ CLOG, HALF_CLOG = ("recorded", "recorded, sticky, clog"), ("recorded", "recorded
 AXES = (5.0, 10.0, 20.0, 50.0, 100.0)
 
 
+@instead(lambda gap: {"picture": placeholder("harm", TITLE, gap), "rows": (), "clustered": ""})
 def harms(sources: Sources, board: Board | Missing) -> dict[str, Any]:
     """The chart, and the contestants as a table: those that may run first."""
-    if isinstance(board, Missing):
-        return {"picture": placeholder("harm", TITLE, board), "rows": (), "clustered": ""}
+    board = need(board)
     limits = bars(sources.evidence, board)
     found = {name: harm_of(board, name, limits) for name in board.names}
     known = {name: harm for name, harm in found.items() if isinstance(harm, Harm)}
     if not known:
-        gap = Missing("not measured", "no run from a good start", "Run ./run dvc repro evaluate_setpoint")
-        return {"picture": placeholder("harm", TITLE, gap), "rows": (), "clustered": ""}
+        remedy = "Run ./run dvc repro evaluate_setpoint"
+        raise Absent(Missing("not measured", "no run from a good start", remedy))
     seconds = decision_seconds(sources)
     rows = [_row(board, name, harm, seconds) for name, harm in known.items()]
     clog = case_text(CLOG, whole=True)
@@ -42,8 +43,6 @@ def harms(sources: Sources, board: Board | Missing) -> dict[str, Any]:
         "that may run. Grey: harm that is allowed in some case."
     )
     picture = Picture(
-        "harm",
-        TITLE,
         _finding(board, known, limits),
         [
             PictureColumn(
@@ -52,6 +51,8 @@ def harms(sources: Sources, board: Board | Missing) -> dict[str, Any]:
         ],
         caption,
         page.origin(sources.source("scoreboard", "choice")),
+        "harm",
+        TITLE,
     )
     return {"picture": picture, "rows": rows, "clustered": clustered(board)}
 

@@ -1,7 +1,7 @@
 """The page of the setpoint loop: who sets flow and temperature by default, what each controller makes of each
 case, and what the camera's classifier is worth."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 from pipeline.report.deposition.page import flat
 from pipeline.report.setpoint import agent as setpoint_agent
@@ -15,7 +15,7 @@ from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import BEYOND
 from pipeline.verdict.digits import THIN, band, number, percent, quantity
-from pipeline.verdict.evidence import lookup
+from pipeline.verdict.evidence import gap_of, known, lookup, need, need_figure, or_nothing
 from pipeline.verdict.setpoint import (
     DATA_DRIVEN,
     MODEL_BASED,
@@ -71,7 +71,7 @@ LANES = {"data_driven": "dd", "model_based": "mb", "baseline": "acc"}
 def render(sources: Sources) -> str:
     """The text of setpoint.html."""
     judged, scores = sources.verdicts["setpoint"], board(sources.evidence, sources.subject("setpoint"))
-    judged_scores = None if isinstance(scores, Missing) else scores
+    judged_scores = known(scores, None)
     claimed = setpoint_agent.claims(sources)
     return page.render(
         "setpoint.html",
@@ -93,7 +93,7 @@ def render(sources: Sources) -> str:
         and bool(judged_scores.default)
         and judged_scores.kinds[judged_scores.default] != DATA_DRIVEN,
         summary=summary(sources.evidence, judged_scores) if judged_scores and judged_scores.default else "",
-        no_board=scores if isinstance(scores, Missing) else None,
+        no_board=gap_of(scores),
         heads=heads(judged_scores),
         answers=answers(sources, judged_scores) if judged_scores else [],
         better=_better(judged_scores) if judged_scores else 0,
@@ -106,8 +106,8 @@ def render(sources: Sources) -> str:
         strips=setpoint_why.strips(sources),
         training=setpoint_agent.training(sources),
         phases=setpoint_agent.phases(sources),
-        claims=[] if isinstance(claimed, Missing) else claimed,
-        claims_missing=claimed if isinstance(claimed, Missing) else None,
+        claims=known(claimed, []),
+        claims_missing=gap_of(claimed),
         guesses=setpoint_agent.guesses(sources),
         agent_made=setpoint_agent.kept_sentence(),
         good_named=good_named(sources),
@@ -127,23 +127,22 @@ def render(sources: Sources) -> str:
     )
 
 
+@or_nothing
 def good_named(sources: Sources) -> str:
     """How many frames of good prints the classifier names good."""
-    table = sources.tables["classified"]
-    if isinstance(table, Missing):
-        return ""
+    table = need(sources.tables["classified"])
     right = table["named"][table["label"] == GOOD] == GOOD
     if not len(right):
         return ""
     return f"Of {len(right):,} frames of good prints {percent(100 * float(right.mean()), 2)} are named good."
 
 
+@or_nothing
 def choice_sentence(sources: Sources) -> str:
     """Why the default is the default, as the stage that chose it says, and who may not run."""
-    said, refused = (lookup(sources.tables["choice"], key) for key in ("sentence", "refused"))
-    if isinstance(said, Missing):
-        return ""
-    barred = [] if isinstance(refused, Missing) else [f"{name} {why}." for name, why in refused.items()]
+    said = need_figure(sources.tables["choice"], "sentence")
+    refused = known(lookup(sources.tables["choice"], "refused"), {})
+    barred = [f"{name} {why}." for name, why in refused.items()]
     return " ".join([str(said), *(["May not run:"] if barred else []), *barred]).replace("+-", "±")
 
 
@@ -225,15 +224,12 @@ def _share_of(cell: Cell | None) -> float:
 
 def _lost(cell: Cell | None, what: str = "settled") -> Figure | Missing:
     share = Missing("not measured", "this case was not run") if cell is None else getattr(cell, what)
-    return (
-        share
-        if isinstance(share, Missing)
-        else Figure(*(max(100 - end, 0.0) for end in (share.value, share.high, share.low)))
-    )
+    ends = () if gap_of(share) else (share.value, share.high, share.low)
+    return gap_of(share) or Figure(*(max(100 - end, 0.0) for end in ends))
 
 
 def _reading(name: str, cell: Cell | None, lost: Question, css: str) -> dict[str, Any]:
-    if cell is None or isinstance(cell.settled, Missing):
+    if cell is None or not isinstance(cell.settled, Figure):
         return {"css": css, "name": name, "value": "not measured", "band": "", "bad": False}
     interval = band(cell.settled.low, cell.settled.high, 1)
     return {
@@ -250,16 +246,6 @@ def _stay(cell: Cell | None) -> str:
 
 
 # ---- the scoreboard
-
-
-class BoardCell(NamedTuple):
-    """One controller in one case, in words; bold in its own worst case."""
-
-    lines: list[dict[str, Any]]
-    steps: str = ""
-    more: str = ""
-    tip: str = ""
-    bold: bool = False
 
 
 def boards(sources: Sources, scores: Board) -> list[dict[str, Any]]:
@@ -303,9 +289,10 @@ def _row(scores: Board, name: str, cases: list[Case], limits: dict[str, float]) 
     }
 
 
-def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> BoardCell:
+def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> dict[str, Any]:
+    """One controller in one case, in words; bold in its own worst case."""
     if cell is None:
-        return BoardCell([])
+        return {"lines": [], "steps": "", "more": "", "tip": "", "bold": False}
     lines = []
     for what, word in (("settled", ""), ("stay", "stay "), ("recovered", "recover ")):
         share = getattr(cell, what)
@@ -326,7 +313,7 @@ def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> BoardCe
     more += f", off {number(cell.flow_error, 1)}{THIN}%" if cell.flow_error == cell.flow_error else ""
     flow, degrees, share = cell.worst_start
     tip = f"{cell.runs:,} runs; fewest settle from {flow:g} % and {degrees:g} °C: {number(share, 0)} %"
-    return BoardCell(lines, steps, more.strip(", "), tip, bold)
+    return {"lines": lines, "steps": steps, "more": more.strip(", "), "tip": tip, "bold": bold}
 
 
 def _worth(cell: Cell, what: str, share: Figure) -> str:

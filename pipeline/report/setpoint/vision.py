@@ -2,18 +2,28 @@
 training, frames with key areas, what was held and foreign."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.published import ALPHA
 from pipeline.verdict.digits import THIN, band, number, percent, quantity, short
-from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.evidence import (
+    Absent,
+    Table,
+    entry,
+    gap_of,
+    instead,
+    lookup,
+    need,
+    need_figure,
+    or_empty,
+)
 from pipeline.verdict.setpoint import CLASS_BORDERS, accuracy, share_text
 from pipeline.verdict.verdict import Figure, Missing
 
@@ -29,34 +39,30 @@ DIAGRAMS = (
 )
 
 
+@as_picture("reliability", "When it says 80 %, is it right in 80 %?")
 def reliability(sources: Sources) -> Picture:
     """Share that is right against the confidence that was stated, before and after calibration."""
-    table, metrics = sources.tables["reliability"], sources.metrics["train_classifier"]
-    title = "When it says 80 %, is it right in 80 %?"
-    if isinstance(table, Missing):
-        return placeholder("reliability", title, table)
-    errors = [lookup(metrics, key) for *_, key in DIAGRAMS]
+    table, metrics = need(sources.tables["reliability"]), sources.metrics["train_classifier"]
+    errors = [entry(metrics, key) for *_, key in DIAGRAMS]
     columns = []
     for (of, method, head, small, _), error in zip(DIAGRAMS, errors, strict=True):
         mine = (table["of"] == of) & (table["method"] == method) & (table["count"] > 0)
         if mine.any():
-            words = "not measured" if isinstance(error, Missing) else f"off by {number(error, 3)} on average"
+            words = "not measured" if error is None else f"off by {number(error, 3)} on average"
             bins = {name: table[name][mine] for name in ("confidence", "accuracy", "count")}
             panel = _diagram(bins, head, of, words, title="" if columns else "share right")
         else:
             gap = Missing("not measured", f"no diagram of {method}")
-            panel = Markup('<div class="hole">{}</div>').format(page.missing(gap))
+            panel = page.hole(gap)
         columns.append(PictureColumn(head, small, "", [panel]))
     text = (
         "Some of the calibration errors were not measured."
-        if any(isinstance(value, Missing) for value in errors)
+        if None in errors
         else f"Calibration takes the error of an image from {number(errors[0], 3)} to "
         f"{number(errors[1], 3)}, and of a window from {number(errors[2], 3)} (counting classes, as "
         f"published) to {number(errors[3], 3)}."
     )
     return Picture(
-        "reliability",
-        title,
         text,
         columns,
         "Share of answers that are right, against the confidence stated with them; dashed: as "
@@ -85,11 +91,10 @@ def _diagram(bins: Table, head: str, of: str, words: str, *, title: str) -> Mark
     return charts.panel(frame, layers, alt=alt, css="dd", title=title, units=("stated", "right"))
 
 
+@as_picture("confusion", "What is taken for what, by temperature")
 def confusion(sources: Sources) -> Picture:
     """True class against the class named, by temperature (figure 5c)."""
-    table, title = sources.tables["classified"], "What is taken for what, by temperature"
-    if isinstance(table, Missing):
-        return placeholder("confusion", title, table)
+    table = need(sources.tables["classified"])
     columns, right, swapped = [], {}, 0
     for degrees in np.unique(np.round(table["temperature_degC"] / 10) * 10)[:7]:
         mine = np.abs(table["temperature_degC"] - degrees) <= 5
@@ -114,8 +119,6 @@ def confusion(sources: Sources) -> Picture:
         "errors sit at the borders of the classes."
     )
     return Picture(
-        "confusion",
-        title,
         text,
         columns,
         (
@@ -160,19 +163,14 @@ def _matrix(counts: np.ndarray, degrees: float) -> Markup:
 # ---- windows
 
 
+@as_picture("distributions", "What a window says, by true flow")
 def distributions(sources: Sources) -> Picture:
     """The scaled distribution (4) by true flow: of recorded windows,
     and as the paper's simulator draws it (figure 4)."""
-    table, title = sources.tables["windows"], "What a window says, by true flow"
-    if isinstance(table, Missing):
-        return placeholder("distributions", title, table)
+    table = need(sources.tables["windows"])
     mine = {name: values[table["part"] == "judge"] for name, values in table.items()}
     if not len(mine["flow_bin"]):
-        return placeholder(
-            "distributions",
-            title,
-            Missing("not measured", "no window to judge by", "Run ./run dvc repro train_classifier"),
-        )
+        raise Absent(Missing("not measured", "no window to judge by", "Run ./run dvc repro train_classifier"))
     flow, scaled, right = _by_bin(mine)
     high = min(float(mine["flow_high_percent"].max()), 320.0)
     frame = charts.Frame(
@@ -208,8 +206,6 @@ def distributions(sources: Sources) -> Picture:
     ]
     rest = float(np.mean(np.delete(right, worst))) if len(right) > 1 else float(right[0])
     return Picture(
-        "distributions",
-        title,
         f"Between {places[worst]} of flow only {number(float(right[worst]), 0)}{THIN}% of the "
         f"windows are named rightly, elsewhere {number(rest, 0)}{THIN}% on average: what the "
         "paper’s simulator draws does not know this.",
@@ -272,33 +268,29 @@ def _by_bin(mine: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 # ---- training
 
 
+@as_picture("course", "The classifier in training")
 def learning_curves(sources: Sources) -> Picture:
     """Loss and accuracy of both networks, epoch by epoch (figure 5b)."""
-    table, metrics = sources.tables["course"], sources.metrics["train_classifier"]
-    title = "The classifier in training"
-    if isinstance(table, Missing):
-        return placeholder("course", title, table)
+    table, metrics = need(sources.tables["course"]), sources.metrics["train_classifier"]
     if not len(table["epoch"]):
         gap = Missing("not applicable", "few own pictures train no network: only its last layer was fitted")
-        return placeholder("course", title, gap)
+        raise Absent(gap)
     svc, limit = accuracy(metrics, "svc_image"), 100 * sources.declared.rules.image_accuracy
     columns, sentences = [], []
     for name, rows in pd.DataFrame(table).groupby("learner", sort=False):
         learner, mine = str(name), {str(column): values.to_numpy() for column, values in rows.items()}
         x = charts.linear(0, max(float(mine["epoch"].max()), 1.0), ticks=5)
-        best = lookup(metrics, f"best_epoch.{learner}")
+        best = entry(metrics, "best_epoch", learner)
         share = 100 * mine["held_out_accuracy"]
         highest = float(np.nanmax(share)) if np.isfinite(share).any() else math.nan
         sentences.append(
             f"{learner} {number(highest, 1)}{THIN}% at best"
-            + ("" if isinstance(best, Missing) else f", epoch {best} kept")
+            + ("" if best is None else f", epoch {best} kept")
         )
         alt = f"{learner}: {number(highest, 1)} % of the watched images are named rightly at best"
         panels = [_losses(learner, mine, x), _accuracies(mine["epoch"], share, x, limit, svc, alt)]
         columns.append(PictureColumn(learner[:1].upper() + learner[1:], "", "", panels))
     return Picture(
-        "course",
-        title,
         f"On segments that are only watched: {'; '.join(sentences)}.",
         columns,
         "Mean cross entropy above, share of images named rightly below, against epochs. Grey line: "
@@ -349,26 +341,16 @@ def _accuracies(
 # ---- tables and frames
 
 
-class Foreign(NamedTuple):
-    """How one kind of foreign picture was detected, in words."""
-
-    kind: str
-    auroc: str
-    detected: str
-    alarms: str
-
-
+@as_table()
 def yardsticks(sources: Sources) -> dict[str, Any]:
     """The transformer beside the simpler ways, an image and a window."""
-    metrics = sources.metrics["train_classifier"]
-    if isinstance(metrics, Missing):
-        return {"missing": metrics}
+    metrics = need(sources.metrics["train_classifier"])
     rows = []
     for name, head in (
         ("", "Vision transformer"),
         *((key, text[:1].upper() + text[1:]) for key, text in NAMES.items()),
     ):
-        if isinstance(accuracy(metrics, f"{name}_image".strip("_")), Missing):
+        if gap_of(accuracy(metrics, f"{name}_image".strip("_"))):
             continue  # of few own pictures no other way is learned
         cells = []
         # of windows of all flows none is asked: the rule asks for 70 to 150 %
@@ -383,22 +365,24 @@ def yardsticks(sources: Sources) -> dict[str, Any]:
             )
         rows.append({"name": head, "mark": "baseline" if name else "data_driven", "cells": cells})
     said = lookup(metrics, "proof.verdict")
-    proof = said.sentence() if isinstance(said, Missing) else f"The classifier: {said}."
-    foreign = lookup(metrics, "out_of_distribution")
-    return {"missing": None, "rows": rows, "proof": proof, "foreign": _foreign(foreign)}
+    proof = gap.sentence() if (gap := gap_of(said)) else f"The classifier: {said}."
+    return {"rows": rows, "proof": proof, "foreign": _foreign(metrics)}
 
 
-def _foreign(detection: Any) -> list[Foreign]:
-    """A row for each kind of foreign picture."""
-    if isinstance(detection, Missing):
-        return []
-    rows = []
-    for kind, figures in detection.items():
-        if isinstance(figures, dict) and "auroc" in figures:
-            alarms = figures.get("false_alarms", detection.get("false_alarms"))
-            area, found = _area(figures["auroc"]), _share(figures.get("found"))
-            rows.append(Foreign(str(kind), area, found, _share(alarms)))
-    return rows
+@or_empty
+def _foreign(metrics: Any) -> list[dict[str, str]]:
+    """How each kind of foreign picture was detected."""
+    detection = need_figure(metrics, "out_of_distribution")
+    return [
+        {
+            "kind": str(kind),
+            "auroc": _area(figures["auroc"]),
+            "detected": _share(figures.get("found")),
+            "alarms": _share(figures.get("false_alarms", detection.get("false_alarms"))),
+        }
+        for kind, figures in detection.items()
+        if isinstance(figures, dict) and "auroc" in figures
+    ]
 
 
 def _share(value: float | None) -> str:
@@ -409,22 +393,14 @@ def _area(value: float | None) -> str:
     return "not measured" if value is None else number(float(value), 3)
 
 
+@instead(lambda gap: [("Frames", gap.sentence())])
 def data(sources: Sources) -> list[tuple[str, str]]:
     """What was shown to it: frames, rejections by reason, segments."""
     metrics = sources.metrics["train_classifier"]
-    counts = lookup(metrics, "data")
-    if isinstance(counts, Missing):
-        return [("Frames", counts.sentence())]
+    counts = need_figure(metrics, "data")
     frames, valid = counts.get("frames"), counts.get("valid")
     rejected = counts.get("rejected") or {}
-    rows = [
-        (
-            "Source",
-            str(lookup(metrics, "source"))
-            if not isinstance(lookup(metrics, "source"), Missing)
-            else "not said",
-        )
-    ]
+    rows = [("Source", str(entry(metrics, "source") or "not said"))]
     rows += (
         [("Frames", f"{frames:,}, of which {valid:,} ({percent(100 * valid / frames, 3)}) show a fresh line")]
         if frames and valid is not None
@@ -433,13 +409,8 @@ def data(sources: Sources) -> list[tuple[str, str]]:
     if isinstance(rejected, dict):
         rows += [("Rejected", ", ".join(f"{reason} {n:,}" for reason, n in rejected.items()) or "none")]
     rows += [("Segments", f"{counts['segments']:,}")] if isinstance(counts.get("segments"), int) else []
-    size, n = lookup(metrics, "size"), lookup(metrics, "parameters")
-    rows += (
-        [("Classifier", f"{size}, {n:,} parameters")]
-        if not isinstance(n, Missing) and not isinstance(size, Missing)
-        else []
-    )
-    return rows
+    size, n = entry(metrics, "size"), entry(metrics, "parameters")
+    return rows + ([("Classifier", f"{size}, {n:,} parameters")] if size and n else [])
 
 
 # kinds of real frames in the order of the page
@@ -455,18 +426,16 @@ RECORDED = (
 )
 
 
+@as_table(lead="")
 def frames(sources: Sources) -> dict[str, Any]:
     """Frames with key area and direction drawn in, of a rejected one the reason; where the classifier learned
     from recordings real ones: accepted, wrong, rejected and foreign, each with its share."""
-    index = sources.tables["nozzle_frames"]
-    if isinstance(index, Missing):
-        return {"missing": index, "lead": ""}
+    index = need(sources.tables["nozzle_frames"])
     table: list[Any] = list(index)
     recorded = [row for row in table if row.get("group") in GROUPS]
     origin = page.origin(sources.source("nozzle_frames"))
     if not recorded:
         return {
-            "missing": None,
             "groups": [{"head": "", "share": "", "shown": [_frame(row) for row in table]}],
             "lead": RENDERED,
             "origin": origin,
@@ -477,7 +446,7 @@ def frames(sources: Sources) -> dict[str, Any]:
         share = percent(100 * mine[0]["share"], 2) if mine and mine[0].get("share") is not None else ""
         if mine:
             groups.append({"head": head, "share": share, "shown": [_frame(row) for row in mine]})
-    return {"missing": None, "groups": groups, "lead": RECORDED, "origin": origin}
+    return {"groups": groups, "lead": RECORDED, "origin": origin}
 
 
 def _frame(row: dict[str, Any]) -> dict[str, Any]:

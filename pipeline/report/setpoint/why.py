@@ -9,11 +9,12 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
+from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import FLOW_BAND, TEMPERATURE_BAND
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 from pipeline.verdict.digits import THIN, count, number
-from pipeline.verdict.evidence import Table
+from pipeline.verdict.evidence import Table, need
 from pipeline.verdict.verdict import Missing
 
 EPISODES, WIDTH, LEFT = 2, 1112, 36
@@ -44,11 +45,10 @@ class Held(NamedTuple):
     reason: str
 
 
+@as_table()
 def strips(sources: Sources) -> dict[str, Any]:
     """The episodes in the order of the table."""
-    table = sources.tables["decisions"]
-    if isinstance(table, Missing):
-        return {"missing": table}
+    table = need(sources.tables["decisions"])
     episodes = itertools.islice(pd.DataFrame(table).groupby("episode", sort=False), EPISODES)
     shown = [
         _strip({str(column): values.to_numpy() for column, values in rows.items()}, str(name), i)

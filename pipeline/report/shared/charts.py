@@ -240,6 +240,14 @@ def readable(frame: Frame, units: tuple[str, str] = ("", "")) -> Markup:
 
 # ---- layers
 
+CIRCLE = np.stack([of(np.linspace(0, 2 * np.pi, 181)) for of in (np.cos, np.sin)])  # the unit circle
+
+
+def inside(frame: Frame, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those of the points that lie on the panel."""
+    seen = (x >= frame.x.low) & (x <= frame.x.high) & (y >= frame.y.low) & (y <= frame.y.high)
+    return x[seen], y[seen]
+
 
 def decimated(x: np.ndarray, y: np.ndarray, most: int = 240) -> tuple[np.ndarray, np.ndarray]:
     """At most 3 `most` points: of each of `most` stretches its lowest and its

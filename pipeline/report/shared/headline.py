@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict import loops as verdict_loops
 from pipeline.verdict.digits import count, shortened
-from pipeline.verdict.verdict import Missing
+from pipeline.verdict.evidence import known
 
 NAMES = ("temperature", "deposition", "setpoint")
 MOVES = ("heaters to barrel", "plunger to flow", "camera to setpoints")
@@ -79,8 +79,8 @@ def data(sources: Sources, names: Sequence[str]) -> str:
     made = [name for name in names if simulated(sources, name)]
     if len(made) == len(names):
         return "Simulated machines; no recording was read."
-    table = sources.tables["record"]
-    read = [] if isinstance(table, Missing) or not sources.recorded else list(np.unique(table["recording"]))
+    table = known(sources.tables["record"], None) if sources.recorded else None
+    read = list(np.unique(table["recording"])) if table else []
     listed = ", ".join(shortened(str(name), 40) for name in read[:2])
     more = f" and {len(read) - 2} more" if len(read) > 2 else ""
     told = {"temperature": f"temperature {count(len(read), 'recording')} ({listed}{more})" if read else ""}

@@ -150,6 +150,11 @@ def missing(gap: Missing) -> Markup:
     )
 
 
+def hole(gap: Missing) -> Markup:
+    """The same in the place of a panel."""
+    return Markup('<div class="hole">{}</div>').format(missing(gap))
+
+
 # sources that the viewer shows by the same name; a test holds them against its tables
 IN_VIEWER = (
     "trajectories",

@@ -5,7 +5,7 @@ import numpy as np
 from pipeline.report.shared import charts
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.judgement import Judgement
-from pipeline.report.temperature.pictures import drawn
+from pipeline.report.temperature.pictures import list_drawn
 from pipeline.verdict.evidence import Table, entry
 from pipeline.verdict.temperature import comparison
 
@@ -15,7 +15,7 @@ def runs_of(sources: Sources, judged: Judgement, table: Table) -> tuple[dict[str
     subject of the verdict leaves furthest from its reference."""
     runs = {
         who: np.flatnonzero((table["contestant"] == who) & (table["case_name"] == "deciding"))
-        for who in drawn(sources, judged)
+        for who in list_drawn(sources, judged)
     }
     runs = {who: rows for who, rows in runs.items() if len(rows)}
     names = [output.name for output in sources.declared.machine.outputs]

@@ -3,32 +3,21 @@
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import PictureColumn
-from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import count, number, percent, short
-from pipeline.verdict.evidence import Table
+from pipeline.verdict.evidence import Table, gap_of
 from pipeline.verdict.verdict import Missing
 
 # ---- orders, for the page of the identification
 
 
-def _holed(head: str, small: str, missing: Missing, mark: str = "") -> PictureColumn:
-    return PictureColumn(
-        head, small, mark, [Markup('<div class="hole">{}</div>').format(page.missing(missing))]
-    )
-
-
 _SMALL = {"width": 270, "height": 160, "left": 44}
 
 
-def singular(sources: Sources) -> PictureColumn:
-    head, small = "Singular values", "of the identification, by order; log"
-    table = sources.tables["order"]
-    if isinstance(table, Missing):
-        return _holed(head, small, table, "model_based")
+def singular(table: Table) -> PictureColumn:
+    """Singular values of the identification, by order."""
     order, values, edge = table["order"], table["singular_value"], float(table["noise_edge"][0])
     positive = np.append(values[values > 0], edge if edge > 0 else values.max())
     frame = charts.Frame(
@@ -47,22 +36,17 @@ def singular(sources: Sources) -> PictureColumn:
     last_value = values[order == last]
     size = short(float(last_value[0])) if len(last_value) else "none"
     alt = f"Order {last} is chosen: its singular value {size}, noise alone reaches {short(edge)}"
-    return PictureColumn(head, small, "model_based", [charts.panel(frame, layers, alt=alt, css="mb")])
+    small = "of the identification, by order; log"
+    return PictureColumn("Singular values", small, "", [charts.panel(frame, layers, alt=alt, css="mb")])
 
 
-def left_out(sources: Sources) -> PictureColumn:
+def left_out(table: Table) -> PictureColumn:
+    """The error of each order on what was left out."""
     head, small = "Error of each order", "on blocks left out, share of the outputs’ variation"
-    table = sources.tables["order"]
-    if isinstance(table, Missing):
-        return _holed(head, small, table, "model_based")
     compared = np.isfinite(table["error"])
     if not compared.any():
-        return _holed(
-            head,
-            small,
-            Missing("not applicable", "the rank alone decided, or the order was given"),
-            "model_based",
-        )
+        gap = Missing("not applicable", "the rank alone decided, or the order was given")
+        return PictureColumn(head, small, "", [page.hole(gap)])
     order, error, chosen = (table[name][compared] for name in ("order", "error", "chosen"))
     frame = charts.Frame(
         charts.linear(0, float(order[-1]) + 1), charts.linear(0, 1.1 * float(error.max())), **_SMALL
@@ -79,7 +63,7 @@ def left_out(sources: Sources) -> PictureColumn:
         ]
         outcome = f"order {at:g} leaves {percent(100 * least, 2)} of the variation unexplained"
     alt = f"Error on left-out blocks by order: {outcome}"
-    return PictureColumn(head, small, "model_based", [charts.panel(frame, layers, alt=alt, css="mb")])
+    return PictureColumn(head, small, "", [charts.panel(frame, layers, alt=alt, css="mb")])
 
 
 # ---- the course of a search
@@ -98,12 +82,9 @@ def dots_and_line(rows: Table) -> str:
 def progress(rows: Table, head: str, small: str, level: Any, *, excess: bool) -> PictureColumn:
     """The candidates of one search beside a level: of the default weights, or with `excess` of the known
     optimum, above which the costs are then drawn in per cent."""
-    if not len(rows["cost"]) or isinstance(level, Missing):
-        return _holed(
-            head,
-            small,
-            level if isinstance(level, Missing) else Missing("not measured", "no search was recorded"),
-        )
+    if not len(rows["cost"]) or gap_of(level):
+        none = Missing("not measured", "no search was recorded")
+        return PictureColumn(head, small, "", [page.hole(gap_of(level) or none)])
     at, cost, best = (rows[name].astype(float) for name in ("evaluation", "cost", "incumbent"))
     if excess:
         cost, best = (100 * (values / level - 1) for values in (cost, best))

@@ -4,9 +4,8 @@ from typing import Any
 
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import THIN, short
-from pipeline.verdict.evidence import lookup
+from pipeline.verdict.evidence import entry, need, need_figure, or_empty, or_none
 from pipeline.verdict.identification import flagged_sentence
-from pipeline.verdict.verdict import Missing
 
 
 def findings(sources: Sources) -> list[tuple[str, str]]:
@@ -30,19 +29,18 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
     return [item for item in claims if item]
 
 
+@or_empty
 def _still(sources: Sources) -> list[tuple[str, str]]:
     """The zones that ingest left out of the design, and what would let them be judged."""
-    quality = sources.tables["quality"]
-    if isinstance(quality, Missing):
-        return []
+    quality = need(sources.tables["quality"])
     messages = quality["message"][quality["kind"] == "still"]
     return [(f"{message.partition(':')[0]} is not judged.", f"{message}.") for message in messages]
 
 
 def _flagged(sources: Sources) -> tuple[str, str] | None:
     """A word where controllers are designed from a model with gains that physics forbids."""
-    gains = lookup(sources.metrics["identify_plant"], "forbidden_gains")
-    if isinstance(gains, Missing) or not gains:
+    gains = entry(sources.metrics["identify_plant"], "forbidden_gains")
+    if not gains:
         return None
     certain = any(gain["certain"] for gain in gains)
     return (
@@ -56,11 +54,10 @@ def _flagged(sources: Sources) -> tuple[str, str] | None:
     )
 
 
+@or_none
 def _printer(sources: Sources) -> tuple[str, str] | None:
     """The printer's own PID, where a recording tells it, and where it stands beside the others."""
-    own = lookup(sources.tables["printer_pid"], "heaters")
-    if isinstance(own, Missing):
-        return None
+    own = need_figure(sources.tables["printer_pid"], "heaters")
     gains = [
         f"{pid['input']} by Kp {short(pid['Kp'])}, Ki {short(pid['Ki'])}, Kd {short(pid['Kd'])}"
         for pid in own
@@ -68,9 +65,9 @@ def _printer(sources: Sources) -> tuple[str, str] | None:
     holds = f"The printer holds {'; '.join(gains)}, in % of duty, °C and s."
     simc = "The page of the identification sets it beside one by SIMC."
     evaluated = sources.metrics["evaluate_temperature"]
-    if isinstance(lookup(evaluated, "contestants.printer_pid"), Missing):
-        reason = lookup(evaluated, "refused.printer_pid")
-        why = "It was not judged." if isinstance(reason, Missing) else f"It was refused: {reason}."
+    if entry(evaluated, "contestants", "printer_pid") is None:
+        reason = entry(evaluated, "refused", "printer_pid")
+        why = f"It was refused: {reason}." if reason else "It was not judged."
         return "The printer’s own PID is not among these contestants.", f"{holds} {why} {simc}"
     return (
         "The printer’s own PID is among these contestants, as it is.",
@@ -82,8 +79,8 @@ def _printer(sources: Sources) -> tuple[str, str] | None:
 
 def _held_stable(evaluated: Any) -> str:
     """A sentence where the printer's own PID does not hold every plant stable."""
-    plants = lookup(evaluated, "contestants.printer_pid.stable")
-    if isinstance(plants, Missing) or plants["count"] == plants["of"]:
+    plants = entry(evaluated, "contestants", "printer_pid", "stable")
+    if not plants or plants["count"] == plants["of"]:
         return ""
     return (
         f"It holds {plants['count']} of {plants['of']} plants stable: look whether the recorded duty swings "

@@ -3,15 +3,15 @@ words."""
 
 from pipeline.report.shared import headline, page, words
 from pipeline.report.shared.difference import accepted_on
-from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import findings, pictures, recording, scorecard, twelve
 from pipeline.report.temperature.card import deciding
 from pipeline.report.temperature.judgement import Judgement, heads, verdict_parts
 from pipeline.verdict.controllers import BY_NAME
+from pipeline.verdict.evidence import need
 from pipeline.verdict.temperature import comparison, refused
 from pipeline.verdict.temperature import names as names_judged
-from pipeline.verdict.verdict import Missing
 
 WORDS = (
     "verdict",
@@ -36,13 +36,12 @@ WORDS = (
 )
 
 
+@as_picture("worst-zone", "The case that decides: error of the worst zone")
 def worst_zone(sources: Sources, judged: Judgement) -> Picture:
     """The controllers over one another in the case that decides: the error of the worst zone."""
-    title, found = "The case that decides: error of the worst zone", deciding(sources, judged, (566, 230))
-    if isinstance(found, Missing):
-        return placeholder("worst-zone", title, found)
+    found = need(deciding(sources, judged, (566, 230)))
     column = PictureColumn("", "", "", [found.drawn])
-    return Picture("worst-zone", title, found.finding, [column], "", found.origin)
+    return Picture(found.finding, [column], "", found.origin)
 
 
 def render(sources: Sources, judged: Judgement) -> str:

@@ -8,12 +8,12 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading, in_a_sentence, kind
 from pipeline.verdict.digits import THIN, count, number, short
-from pipeline.verdict.evidence import Table, entry
+from pipeline.verdict.evidence import Absent, Table, entry, need
 from pipeline.verdict.pairs import curve_sentence, pair_names, reference_of
 from pipeline.verdict.temperature import comparison, names, refused
 from pipeline.verdict.verdict import Missing
@@ -23,7 +23,7 @@ CASES = {"typical": "A typical case", "deciding": "The case that decides"}
 LARGEST = 1e4
 
 
-def drawn(sources: Sources, judgement: Judgement) -> list[str]:
+def list_drawn(sources: Sources, judgement: Judgement) -> list[str]:
     """Who is drawn: the pair, the best, and PI, in the order of simplicity."""
     wanted = {*pair_names(sources.metrics), judgement.subject, "pi"}
     return [name for name in (*names(sources.metrics), *refused(sources.metrics)) if name in wanted]
@@ -31,12 +31,15 @@ def drawn(sources: Sources, judgement: Judgement) -> list[str]:
 
 def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
     """Temperatures with their references and commands of one case, a column a contestant."""
-    table, title = sources.tables["trajectories"], CASES[name]
-    if isinstance(table, Missing):
-        return placeholder(name, title, table)
+    return as_picture(name, CASES[name])(_case)(sources, judgement, name)
+
+
+def _case(sources: Sources, judgement: Judgement, name: str) -> Picture:
+    table = need(sources.tables["trajectories"])
     without = refused(sources.metrics)
     rows = {
-        who: (table["contestant"] == who) & (table["case_name"] == name) for who in drawn(sources, judgement)
+        who: (table["contestant"] == who) & (table["case_name"] == name)
+        for who in list_drawn(sources, judgement)
     }
     runs = {
         who: {key: values[mask] for key, values in table.items()}
@@ -44,9 +47,7 @@ def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
         if mask.any() and who not in without
     }
     if not runs:
-        return placeholder(
-            name, title, Missing("not measured", f"no trajectory of the {name} case was recorded")
-        )
+        raise Absent(Missing("not measured", f"no trajectory of the {name} case was recorded"))
     settled = entry(comparison(sources.metrics), "settled_steps")
     ends = {
         who: _past(run, [o.name for o in sources.declared.machine.outputs], settled)
@@ -67,12 +68,10 @@ def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
                 _commands(sources, who, runs[who], most, first=not shown),
             ]
             if who in runs
-            else [_hole(without.get(who, "no trajectory was recorded"))]
+            else [page.hole(Missing("failed", without.get(who, "no trajectory was recorded")))]
         )
         shown.append(PictureColumn(heading(who), kind(who), who, panels))
     return Picture(
-        name,
-        title,
         _finding(sources, name, ends),
         shown,
         f"{_extent(whole, runs)}Above: true temperature of every zone in °C, dashed its reference. Below: "
@@ -102,10 +101,6 @@ def _extent(whole: dict[str, Table], runs: dict[str, Table]) -> str:
     """What part of the runs is drawn; "" where all of it is."""
     drawn_s, all_s = (next(iter(part.values()))["time_s"][-1] for part in (runs, whole))
     return f"The first {short(drawn_s, 2)} of {short(all_s, 2)} s. " if drawn_s < all_s else ""
-
-
-def _hole(why: str) -> Markup:
-    return Markup('<div class="hole">{}</div>').format(page.missing(Missing("failed", why)))
 
 
 def _temperatures(sources: Sources, runs: list[Table]) -> charts.Axis:
@@ -185,11 +180,10 @@ def _finding(sources: Sources, name: str, ends: dict[str, tuple[float, str]]) ->
 # ---- plant by plant
 
 
+@as_picture("plants", "Plant by plant")
 def plants(sources: Sources) -> Picture:
     """Cost of the pair on every plant, a line a plant; and the cost of all cases of each contestant."""
-    table, title = sources.tables["cases"], "Plant by plant"
-    if isinstance(table, Missing):
-        return placeholder("plants", title, table)
+    table = need(sources.tables["cases"])
     cases = pd.DataFrame({key: table[key] for key in ("contestant", "plant", "cost")})
     cases = cases[np.isfinite(cases["cost"]) & (cases["cost"] > 0) & (cases["cost"] < 1e9)]
     a, b = pair_names(sources.metrics)
@@ -212,11 +206,9 @@ def plants(sources: Sources) -> Picture:
         name for name in names(sources.metrics) if name in set(cases["contestant"]) and name not in YARDSTICKS
     ]
     if not drawn_names:
-        return placeholder("plants", title, Missing("not measured", "no case has a cost"))
+        raise Absent(Missing("not measured", "no case has a cost"))
     shown.append(PictureColumn("All contestants", "cost of every case", "", [_boxes(cases, drawn_names)]))
     return Picture(
-        "plants",
-        title,
         finding,
         shown,
         f"Cost as deployed, log scale. Left: ink where model-based costs less, blue and dashed where "
@@ -297,13 +289,14 @@ def _boxes(cases: pd.DataFrame, names: list[str]) -> Markup:
 # ---- less of the record
 
 
+@as_picture("record_length", "Less of the record")
 def record_length(sources: Sources) -> Picture:
     """Cost against the length of the record, a curve a controller, and where the pair changes places."""
-    title, curve = "Less of the record", entry(comparison(sources.metrics), "cost_curve")
+    curve = entry(comparison(sources.metrics), "cost_curve")
     if not curve or not curve["controllers"]:
         off = "evaluate_temperature.cost_curve is false in params.expert.yaml"
         why = "No model-based or data-driven controller was learned" if curve else off
-        return placeholder("record_length", title, Missing("not measured", why))
+        raise Absent(Missing("not measured", why))
     minutes = np.array(curve["samples"]) * sources.declared.machine.sample_time_s / 60
     named = {
         name: {key: np.array(values, float) for key, values in own.items()}
@@ -347,8 +340,6 @@ def record_length(sources: Sources) -> Picture:
         frame, layers, alt=finding, css="mb wide", title="cost, log", across="minutes of the record, log"
     )
     return Picture(
-        "record_length",
-        title,
         finding,
         [PictureColumn("Cost", "learned from the beginning of the record", "", [drawn_picture])],
         "Each controller learned again from the beginning of the record, its weights kept, on "

@@ -8,27 +8,28 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
 from pipeline.report.shared.sources import Sources
 from pipeline.temperature.tables import set_point_of
 from pipeline.verdict.digits import THIN, count, number, short
-from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.evidence import Absent, Table, entry, known, lookup, need, need_figure, or_nothing
 from pipeline.verdict.verdict import UNJUDGED, Missing
 
 
 def excitation(sources: Sources) -> Picture:
     """How strongly each input was moved, by frequency."""
-    stage = "generate_probing" if sources.recorded else "probe_machine"
-    metrics = sources.metrics[stage]
-    if sources.recorded:
-        metrics = lookup(metrics, "next_experiment")
     title = "What the next experiment would excite" if sources.recorded else "What the probing excites"
-    levels = lookup(metrics, "level_percent_per_band")
-    if sources.recorded and lookup(metrics, "written") is False:
-        return placeholder("excitation", title, Missing(UNJUDGED, f"Not written: {metrics['reason']}"))
-    if isinstance(levels, Missing):
-        return placeholder("excitation", title, levels)
-    levels, machine = np.array(levels), sources.declared.machine
+    return as_picture("excitation", title)(_excitation)(sources)
+
+
+def _excitation(sources: Sources) -> Picture:
+    stage = "generate_probing" if sources.recorded else "probe_machine"
+    metrics = (
+        lookup(sources.metrics[stage], "next_experiment") if sources.recorded else sources.metrics[stage]
+    )
+    if sources.recorded and entry(metrics, "written") is False:
+        raise Absent(Missing(UNJUDGED, f"Not written: {metrics['reason']}"))
+    levels, machine = np.array(need_figure(metrics, "level_percent_per_band")), sources.declared.machine
     y = charts.linear(0, 1.1 * float(levels.max()), ticks=3)
     names = (
         [signal.name for signal in machine.inputs]
@@ -54,11 +55,11 @@ def excitation(sources: Sources) -> Picture:
             )
         )
     rank, full, order = (lookup(metrics, f"excitation_{key}") for key in ("rank", "full_rank", "order"))
-    condition, limited = lookup(metrics, "excitation_condition"), lookup(metrics, "limited_share")
+    condition, limited = entry(metrics, "excitation_condition"), entry(metrics, "limited_share")
     text = f"Exciting of order {order}: rank {rank} of {full}" + (
-        "." if isinstance(condition, Missing) else f", condition {short(condition)}."
+        "." if condition is None else f", condition {short(condition)}."
     )
-    if not isinstance(limited, Missing):
+    if limited is not None:
         text += (
             f" {number(100 * limited, 0)}{THIN}% of all commands met a limit of amplitude, rate or machine"
         )
@@ -66,8 +67,6 @@ def excitation(sources: Sources) -> Picture:
     if sources.recorded:
         text = f"The experiment that is designed to be run next, not what was recorded. {text}"
     return Picture(
-        "excitation",
-        title,
         text,
         shown,
         "R.m.s. level in per cent within equal bands of frequency, 0 to π rad a step.",
@@ -75,19 +74,12 @@ def excitation(sources: Sources) -> Picture:
     )
 
 
+@as_picture("record", "The record, with what was flagged and masked")
 def record(sources: Sources) -> Picture:
     """Every signal of the record, what is masked and what was found strange."""
-    table, quality, title = (
-        sources.tables["record"],
-        sources.tables["quality"],
-        "The record, with what was flagged and masked",
-    )
-    if isinstance(table, Missing):
-        return placeholder("record", title, table)
+    table, quality = need(sources.tables["record"]), known(sources.tables["quality"], None)
     machine, time = sources.declared.machine, _elapsed(table, sources.declared.machine.sample_time_s)
-    set_points = sources.tables["set_points"]
-    if isinstance(set_points, Missing):
-        set_points = {}
+    set_points = known(sources.tables["set_points"], {})
     masked_total = 0
     halves: list[list[Markup]] = [[], []]
     for half, signals in enumerate((machine.inputs, machine.outputs)):
@@ -111,8 +103,6 @@ def record(sources: Sources) -> Picture:
         PictureColumn(head, small, "", panels) for (head, small), panels in zip(heads, halves, strict=True)
     ]
     return Picture(
-        "record",
-        title,
         text,
         shown,
         (
@@ -126,10 +116,9 @@ def record(sources: Sources) -> Picture:
     )
 
 
+@or_nothing
 def _quarantined(metrics: Any) -> str:
-    quarantined = lookup(metrics, "quarantined")
-    if isinstance(quarantined, Missing):
-        return ""
+    quarantined = need_figure(metrics, "quarantined")
     return (
         "No recording is quarantined."
         if quarantined == 0
@@ -147,7 +136,7 @@ def _signal(
     time: np.ndarray,
     values: np.ndarray,
     masked: np.ndarray,
-    quality: Table | Missing,
+    quality: Table | None,
     set_point: np.ndarray | None,
     *,
     last: bool,
@@ -170,7 +159,7 @@ def _signal(
     layers += [charts.line(frame, time, np.where(masked, np.nan, values), "line thin")]
     stretches = charts.stretches(masked)
     layers += [charts.interval(frame, float(time[a]), float(time[b - 1]), "gone") for a, b in stretches[:200]]
-    mine = [] if isinstance(quality, Missing) else np.flatnonzero(quality["signal"] == signal.name)
+    mine = np.flatnonzero(quality["signal"] == signal.name) if quality else []
     # a flag that spans the record says where it is in words, not in grey over everything
     short_ones = [i for i in mine if quality["end_s"][i] - quality["start_s"][i] < 0.5 * float(time[-1])]
     layers = [
@@ -186,11 +175,10 @@ def _signal(
     return charts.panel(frame, layers, alt=alt, css="mb", title=title, x_ticks=last, units=("s", unit))
 
 
+@as_table(rows=[], more=0)
 def flaws(sources: Sources, most: int = 40) -> dict[str, Any]:
     """The quality findings, those of quarantined recordings first."""
-    table = sources.tables["quality"]
-    if isinstance(table, Missing):
-        return {"rows": [], "more": 0, "missing": table}
+    table = need(sources.tables["quality"])
     quality = pd.DataFrame(table)
     quality = quality.assign(used=quality["kind"] != "quarantined", start=quality["start_s"].fillna(0.0))
     quality = quality.sort_values(["used", "recording", "signal", "kind", "start"])

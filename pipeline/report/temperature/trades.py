@@ -8,7 +8,7 @@ from markupsafe import Markup
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import PictureColumn
 from pipeline.verdict.digits import THIN, count, short
-from pipeline.verdict.evidence import Table
+from pipeline.verdict.evidence import Table, known
 from pipeline.verdict.verdict import Missing
 
 
@@ -30,16 +30,16 @@ def search(rows: Table, trade: Any) -> Search:
 def searched(tried: Search, head: str, small: str) -> PictureColumn:
     """A search as a picture; in its place that nothing worked."""
     if not len(tried.points):
-        gap = page.missing(Missing("not measured", "no candidate of the search worked"))
-        return PictureColumn(head, small, "", [Markup('<div class="hole">{}</div>').format(gap)])
+        gap = Missing("not measured", "no candidate of the search worked")
+        return PictureColumn(head, small, "", [page.hole(gap)])
     return PictureColumn(head, small, "", [_searched(*tried, head)])
 
 
 def _marks(points: np.ndarray, chosen: np.ndarray, trade: Any) -> dict[str, tuple[float, float]]:
     """(effort, error) of the chosen candidate, the default weights and
     the optimum, as far as they are known."""
-    named = {} if isinstance(trade, Missing) else {name: place for name, place in trade.items() if place}
-    at = {name: (place["effort_percent"], place["tracking_degC"]) for name, place in named.items()}
+    named = known(trade, {}).items()
+    at = {name: (place["effort_percent"], place["tracking_degC"]) for name, place in named if place}
     return (
         {"chosen": (float(points[chosen][0, 0]), float(points[chosen][0, 1]))} if chosen.any() else {}
     ) | at

@@ -1,16 +1,15 @@
 """The answers of the temperature loop, a row each: the contestant that the verdict is about beside its rival,
 the limit, and how the figure moved since the accepted run."""
 
-import math
 from typing import Any
 
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.verdict.controllers import heading
-from pipeline.verdict.digits import declared, with_unit
+from pipeline.verdict.evidence import gap_of
 from pipeline.verdict.verdict import PASSED, UNJUDGED, Figure, Missing, Question, state
-from pipeline.verdict.wording import banded, places_of, worded
+from pipeline.verdict.wording import banded, limit_text, places_of, worded
 
 
 def rows(sources: Sources, judged: Judgement) -> list[dict[str, Any]]:
@@ -25,13 +24,6 @@ def _row(question: Question, judged: Judgement, unmoved: str) -> dict[str, Any]:
     move = next((m for m in judged.moved.get(judged.subject, []) if m.question.key == question.key), None)
     moved = move is not None and move.moved
     mine, other = (_state(question, figure) for _, figure in pair)
-    # as it was declared: "10.000 %" reads as ten thousand where a point parts thousands
-    limit = (
-        f"{'≥' if question.at_least else '≤'} "
-        f"{with_unit(question.limit, question.unit, declared(question.limit))}"
-        if math.isfinite(question.limit)
-        else "not resolved"
-    )
     return {
         "n": question.answer,
         "key": question.key,
@@ -39,7 +31,7 @@ def _row(question: Question, judged: Judgement, unmoved: str) -> dict[str, Any]:
         "word": words.explaining(question.key),
         "sub": SUB.get(question.key, ""),
         "cells": [_cell(question, name, figure, places) for name, figure in pair],
-        "limit": "none" if question.key in ("crossings", "supervisor") else limit,
+        "limit": "none" if question.key in COUNTED else limit_text(question) or "not resolved",
         "state": mine,
         "strip": charts.strip(question, [(heading(name), page.MARKS.get(name, "bl"), f) for name, f in pair]),
         "change": move.text() if move else unmoved,
@@ -51,9 +43,12 @@ def _row(question: Question, judged: Judgement, unmoved: str) -> dict[str, Any]:
 
 def _state(question: Question, figure: Figure | Missing) -> str:
     """A contestant that learns nothing needs no data."""
-    return PASSED if isinstance(figure, Missing) and figure.state == UNJUDGED else state(question, figure)
+    gap = gap_of(figure)
+    return PASSED if gap and gap.state == UNJUDGED else state(question, figure)
 
 
+# cases that are counted: none are allowed
+COUNTED = ("crossings", "supervisor")
 SUB = {
     "at_limits": "clipped commands",
     "disk": "weakest tenth of plants",
@@ -76,13 +71,11 @@ def _cell(question: Question, name: str, figure: Figure | Missing, places: int) 
     fraction = figure.note.split(" samples")[0].replace(" of ", " / ")
     return cell | {
         "value": worded(question, figure.value, places),
-        "band": fraction
-        if question.key in ("data", "crossings", "supervisor")
-        else banded(question, figure, places),
+        "band": fraction if question.key in ("data", *COUNTED) else banded(question, figure, places),
     }
 
 
 def drift_state(judged: Judgement) -> str:
     """Passed where the nightly job measured drift and found none, otherwise its word for it."""
     answer = judged.drifted.answer
-    return answer.state if isinstance(answer, Missing) else PASSED
+    return gap.state if (gap := gap_of(answer)) else PASSED

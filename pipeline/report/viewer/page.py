@@ -11,13 +11,14 @@ from markupsafe import Markup
 
 from pipeline.report.certificate import exported
 from pipeline.report.shared import charts, page
+from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources, copies
 from pipeline.report.temperature.deciding import degrees, runs_of, until_settled
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.viewer import packed, series
 from pipeline.verdict.controllers import heading
 from pipeline.verdict.digits import THIN, number, short
-from pipeline.verdict.evidence import OFF
+from pipeline.verdict.evidence import OFF, Absent, gap_of, need, or_no_entries
 from pipeline.verdict.verdict import Missing
 
 VENDOR = Path(__file__).parent / "vendor"
@@ -44,19 +45,10 @@ def render(sources: Sources, judged: Judgement) -> Viewer:
         table = sources.tables["every_lesson" if shown.name == "lessons" else shown.name]
         if table is OFF:
             continue
-        if isinstance(table, Missing):
-            rows.append(
-                {
-                    "title": shown.title,
-                    "note": shown.note,
-                    "rows": "",
-                    "link": "",
-                    "size": "",
-                    "source": "",
-                    "missing": table,
-                    "left_out": "",
-                }
-            )
+        row = {"title": shown.title, "note": shown.note, "rows": "", "link": "", "size": "", "source": ""}
+        row |= {"missing": gap_of(table), "left_out": ""}
+        rows.append(row)
+        if row["missing"]:
             continue
         source = sources.source(shown.name)[0]
         link, size = source.link, packed.size_of(source)
@@ -65,20 +57,8 @@ def render(sources: Sources, judged: Judgement) -> Viewer:
         files |= found.files
         if found.entry["books"]:
             entries.append(found.entry | {"link": link, "size": size, "path": source.path})
-        left_out = _left_out(found.entry)
-        count = number(found.entry["rows"], 0)
-        rows.append(
-            {
-                "title": shown.title,
-                "note": shown.note,
-                "rows": count,
-                "link": link,
-                "size": size,
-                "source": source.path,
-                "missing": None,
-                "left_out": left_out,
-            }
-        )
+        row |= {"rows": number(found.entry["rows"], 0), "link": link, "size": size, "source": source.path}
+        row["left_out"] = _left_out(found.entry)
     script = page.environment().get_template("viewer.js").render().strip()
     text = page.render(
         "viewer.html",
@@ -116,10 +96,11 @@ def _left_out(entry: dict[str, Any]) -> str:
 # ---- the deciding case
 
 
+@or_no_entries
 def start(sources: Sources, judged: Judgement) -> dict[str, Any]:
     """What the viewer shows where its address says nothing: the deciding case of the temperature loop."""
-    table = sources.tables["trajectories"]
-    if isinstance(table, Missing) or not len(table["time_s"]):
+    table = need(sources.tables["trajectories"])
+    if not len(table["time_s"]):
         return {}
     runs, zone = runs_of(sources, judged, table)
     if not runs:
@@ -134,15 +115,13 @@ def start(sources: Sources, judged: Judgement) -> dict[str, Any]:
 STYLES = {"dd": "line dd", "mb": "line", "bl": "line bl"}
 
 
+@as_table(text="", picture=Markup(""), names=[], origin=Markup(""))
 def still(sources: Sources, judged: Judgement) -> dict[str, Any]:
     """The output furthest from its reference in the deciding case, a numbered line a contestant."""
-    table = sources.tables["trajectories"]
-    if isinstance(table, Missing):
-        return {"text": "", "picture": Markup(""), "names": [], "origin": Markup(""), "missing": table}
+    table = need(sources.tables["trajectories"])
     runs, zone = runs_of(sources, judged, table)
     if not runs:
-        gap = Missing("not measured", "no trajectory of the deciding case was recorded")
-        return {"text": "", "picture": Markup(""), "names": [], "origin": Markup(""), "missing": gap}
+        raise Absent(Missing("not measured", "no trajectory of the deciding case was recorded"))
     label = sources.zone([o.name for o in sources.declared.machine.outputs].index(zone))
     seconds, time = until_settled(table, runs, zone), table["time_s"]
     early = {who: rows[time[rows] <= seconds] for who, rows in runs.items()}
@@ -177,5 +156,4 @@ def still(sources: Sources, judged: Judgement) -> dict[str, Any]:
         "picture": picture,
         "names": names,
         "origin": page.files(sources.source("trajectories")),
-        "missing": None,
     }
