@@ -4,8 +4,8 @@ loop moved."""
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from pipeline.report.deposition import change as deposition_change
-from pipeline.report.setpoint import change as setpoint_change
+from pipeline.report.deposition import card as deposition_card
+from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.shared.difference import Difference, Move
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.judgement import Judgement
@@ -95,7 +95,7 @@ def of_loops(sources: Sources, judged: Judgement) -> list[LoopChange]:
         if move.moved
     ]
     streams = deposition_moves(sources)
-    cases = setpoint_change.changes(sources)
+    cases = setpoint_card.changes(sources)
     loops = [
         LoopChange("temperature", temperature, _both([move for _, move in mine])),
         LoopChange("deposition", [_moved(move) for move in streams if move.moved], _both(streams)),
@@ -120,7 +120,7 @@ def _moved(move: Move, whose: str = "") -> Moved:
 
 def deposition_moves(sources: Sources) -> list[Move]:
     """Flow errors of the composer in use, stream by stream."""
-    return deposition_change.moves(sources, known(structures(sources.evidence), []))
+    return deposition_card.moves(sources, known(structures(sources.evidence), []))
 
 
 def inputs(changed: Difference) -> str:

@@ -23,7 +23,7 @@ def render(sources: Sources, verdict: Verdict) -> str:
     """The text of certificate.html; `verdict` is that of the temperature loop on page one."""
     lines = exported.lines(sources, verdict)
     shown = _certificate(sources, lines)
-    whole = gap_of(shown) is None
+    whole = known(shown, None)
     return page.render(
         "certificate.html",
         here="certificate",
@@ -31,13 +31,13 @@ def render(sources: Sources, verdict: Verdict) -> str:
         title="Certificate",
         head=head(shown, lines),
         missing_certificate=gap_of(shown),
-        rules=rule_rows(shown) if whole else [],
+        rules=rule_rows(whole) if whole else [],
         controllers=controllers(sources),
-        about=about(shown) if whole else [],
+        about=about(whole) if whole else [],
         poles=poles(sources, shown),
-        margins=margins(shown) if whole else [],
+        margins=margins(whole) if whole else [],
         judged_margins=judged_margins(sources),
-        bands=band_rows(shown) if whole else [],
+        bands=band_rows(whole) if whole else [],
         lines=known(lines, []),
         origin_of=page.origin(sources.source("certificate", "export_controllers")),
         differences=differences(sources),
@@ -60,8 +60,8 @@ def head(
     shown: Mapping[str, Any] | Missing, lines: Sequence[exported.ExportedLine] | Missing
 ) -> dict[str, Any]:
     """Passed or refused, and the first rule that failed."""
-    said = {"state": "open", "decision": "No certificate.", "reason": "", "lead": "", "remedy": ""}
-    said |= {"claim": "", "changed": "", "rules": (), "heads": ()}
+    said: dict[str, Any] = {"state": "open", "decision": "No certificate.", "reason": "", "lead": ""}
+    said |= {"remedy": "", "claim": "", "changed": "", "rules": (), "heads": ()}
     if gap := gap_of(lines):
         return said | {"reason": gap.sentence()}
     mine = next(line for line in known(lines, []) if line.loop == "temperature")

@@ -18,23 +18,27 @@ from pipeline.report.shared.card import (
     entrant,
     in_order,
     of_verdict,
+    or_no_figures,
     step,
 )
+from pipeline.report.shared.difference import Move
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.deposition import (
     BASELINE,
     COMPOSERS,
     FIRST_TRIALS,
     NAMES,
+    NOT_JUDGED,
     OURS,
+    SAME,
     Structure,
     data_driven,
     structures,
     worst,
 )
 from pipeline.verdict.digits import THIN, band, count, decimals, number
-from pipeline.verdict.evidence import Table, gap_of, need, or_gap, or_nothing
-from pipeline.verdict.verdict import PASSED, Missing, Verdict
+from pipeline.verdict.evidence import Table, known, lookup, need, or_gap, or_nothing
+from pipeline.verdict.verdict import PASSED, Figure, Missing, Question, Verdict
 
 MOVES = "Plunger command to flow at the nozzle"
 # how long a stretch of a part is drawn, s
@@ -44,31 +48,31 @@ Read = Callable[[Structure, str], float | None]
 
 def card(sources: Sources, verdict: Verdict) -> Card:
     """Flow error, line volume and what learning the part itself would gain, of three composers."""
-    parts, next_step = structures(sources.evidence), _step(sources, verdict)
-    if gap := gap_of(parts):
-        return of_verdict(verdict, MOVES, next_step, missing=gap.sentence())
+    return of_verdict(verdict, MOVES, _step(sources, verdict), **_figures(sources, verdict))
+
+
+@or_no_figures
+def _figures(sources: Sources, verdict: Verdict) -> dict[str, Any]:
+    parts = need(structures(sources.evidence))
     asked, names = sources.declared.rules, shown(verdict.winner or "", parts)
     streams = [part for part in parts if part.known()]
     kinds = {name: KIND[name] for name in names}
-    return of_verdict(
-        verdict,
-        MOVES,
-        next_step,
-        entrants=[
+    return {
+        "entrants": [
             # "Library", by its better rule
             entrant(MARK[name], "Library" if KIND[name] == "data-driven" else NAMES[name], note)
             for name, note in in_order(kinds).items()
         ],
-        rows=[
+        "rows": [
             _row("Flow error", streams, names, Structure.error, asked.flow_error_percent, "≤", "%"),
             _row("Line volume", streams, names, Structure.worst_line, asked.line_volume_percent, "±", "%"),
             _row("Above learning it", streams, names, _above, asked.above_whole_points, "≤", "pts"),
         ],
-        basis=f"Worst of {count(len(streams), 'stream')}; small: range",
-        cost=_cost(sources),
-        picture=deciding(sources, verdict),
-        sources=sources.source("scores"),
-    )
+        "basis": f"Worst of {count(len(streams), 'stream')}; small: range",
+        "cost": _cost(sources),
+        "picture": deciding(sources, verdict),
+        "sources": sources.source("scores"),
+    }
 
 
 def shown(winner: str, parts: Sequence[Structure]) -> list[str]:
@@ -182,3 +186,48 @@ def _stretch(table: Table, part: Structure, name: str) -> np.ndarray:
     middle = time[int(np.nanargmax(off))]
     start = min(max(middle - STRETCH_S / 2, time.min()), max(time.max() - STRETCH_S, time.min()))
     return mine[(time >= start) & (time <= start + STRETCH_S)]
+
+
+def moves(sources: Sources, parts: Sequence[Structure]) -> list[Move]:
+    """Of every structure and material the flow error of the composer in use. These errors have no bands: one
+    simulated print each, the same at every run; so noise is what the choice between composers calls equal.
+    """
+    return [_move(sources, part) for part in parts] if known(sources.accepted, None) else []
+
+
+def _move(sources: Sources, structure: Structure) -> Move:
+    question = Question(
+        0,
+        "flow_error_percent",
+        f"Flow error, {structure.part}, {structure.material}",
+        "%",
+        structure.asked.flow_error_percent,
+        False,
+        "",
+    )
+    score, before = structure.known().get(structure.chosen), _accepted(sources, structure)
+    if score is None:
+        why = NOT_JUDGED if structure.unknown() else "not measured"
+        return Move(question, before, Missing("not measured", "nothing to compare"), False, why)
+    now = Figure(score.error, score.error, score.error)
+    if before is None:
+        return Move(question, None, now, False, "new")
+    if before.value == now.value:
+        return Move(question, before, now, False, "unchanged")
+    if abs(now.value - before.value) <= SAME:
+        return Move(question, before, now, False, "within noise")
+    return Move(question, before, now, True, "better" if now.value < before.value else "worse")
+
+
+def _accepted(sources: Sources, structure: Structure) -> Figure | None:
+    """The error of the composer that was in use then, which may be another one."""
+    parts = known(lookup(sources.accepted, "metrics.compose_parts"), {})
+    then = parts.get(structure.part, {}).get(structure.material, {})
+    score = then.get(then.get("chosen"))
+    return Figure(*3 * (float(score["rms_percent_of_on_off"]),)) if score else None
+
+
+def sentence(moves: Sequence[Move]) -> str:
+    """ "Deposition: 1 of 4 flow errors moved." """
+    changed = sum(move.moved for move in moves)
+    return f"Deposition: {changed} of {len(moves)} flow errors moved." if moves else ""

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.deposition import change as deposition_change
+from pipeline.report.deposition import card as deposition_card
 from pipeline.report.deposition import learning as deposition_learning
 from pipeline.report.deposition import parts as deposition_parts
 from pipeline.report.deposition.marks import HEADS, KIND, MARK, PAPER, real
@@ -87,7 +87,7 @@ def render(sources: Sources) -> str:
         no_scores=gap_of(parts),
         answers=[
             _answer(part, move, data_driven(measured))
-            for part, move in itertools.zip_longest(measured, deposition_change.moves(sources, measured))
+            for part, move in itertools.zip_longest(measured, deposition_card.moves(sources, measured))
         ],
         scoreboard=scoreboard(measured, sources.declared.rules),
         learning=deposition_learning.pictures(sources),

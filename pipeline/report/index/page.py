@@ -14,7 +14,7 @@ from pipeline.report.shared.difference import accepted_on
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import card as temperature_card
 from pipeline.report.temperature.judgement import Judgement
-from pipeline.report.temperature.twelve import drift_state
+from pipeline.report.temperature.page import drift_state
 from pipeline.verdict.evidence import need, or_no_entries
 from pipeline.verdict.verdict import FAILED, PASSED, Verdict
 

@@ -10,12 +10,11 @@ from collections.abc import Mapping, Sequence
 
 from pipeline.papers import made
 from pipeline.report.papers import deposition, setpoint, study, temperature
-from pipeline.report.papers.relearned import sentences
 from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS, Paper, read
+from pipeline.report.papers.study import sentences
 from pipeline.report.shared import page
 from pipeline.report.shared.sources import Sources
 from pipeline.store import artifacts
-from pipeline.verdict.evidence import gap_of
 from pipeline.verdict.verdict import Missing
 
 # glyph of a verdict, by the states that the pages know
@@ -35,8 +34,8 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
     shown, gaps = [], []
     for key, (printed, results) in files.items():
         paper = read(printed, results, sources.metrics)
-        if gap := gap_of(paper):
-            gaps.append((key, gap))
+        if isinstance(paper, Missing):
+            gaps.append((key, paper))
             continue
         pictures = PICTURES[key](paper.results, sources)
         shown.append(

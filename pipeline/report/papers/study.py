@@ -2,24 +2,24 @@
 and the parity search."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.shared import charts
+from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
-from pipeline.report.temperature import evidence, trades
-from pipeline.verdict.digits import number, percent, short
-from pipeline.verdict.evidence import Table, gap_of, instead, lookup, need_figure, or_nothing
+from pipeline.verdict.controllers import in_a_sentence
+from pipeline.verdict.digits import THIN, count, number, percent, short
+from pipeline.verdict.evidence import Table, gap_of, instead, known, lookup, need, need_figure, or_nothing
 from pipeline.verdict.verdict import Missing
 
 
 def part(results: Mapping[str, Any] | Missing) -> dict[str, Any]:
     """All that the page shows of the study, from the results of the stage reproduce_study; `honest` and
     `weights` are pairs of title and figure."""
-    study = gap_of(results) or results["figures"]
+    study = lookup(results, "figures")
     return {
         "published": _published(study),
         "honest": _honest(study),
@@ -263,14 +263,14 @@ def _parity(results: Mapping[str, Any] | Missing) -> Picture:
     """The best cost so far above the optimum that is known, and what the candidates trade."""
     table, study = _table(results, "parity"), need_figure(results, "figures")
     optimum = lookup(study, "parity.optimum")
-    head, tried = "The study’s objective", trades.search(table, lookup(study, "parity.trade"))
+    head, tried = "The study’s objective", read_search(table, lookup(study, "parity.trade"))
     return Picture(
         _reached(study),
         [
-            evidence.progress(table, head, "excess over the optimum in %, log", optimum, excess=True),
-            trades.searched(tried, "What its candidates trade", "state known, discounted"),
+            progress(table, head, "excess over the optimum in %, log", optimum, excess=True),
+            draw_search(tried, "What its candidates trade", "state known, discounted"),
         ],
-        f"{evidence.dots_and_line(table)} Beside it: r.m.s. tracking error in °C, up, against r.m.s. "
+        f"{dots_and_line(table)} Beside it: r.m.s. tracking error in °C, up, against r.m.s. "
         "effort in per cent, across; line: the front; filled square: chosen; cross: the optimum, Q = R = I.",
         Markup(""),
     )
@@ -296,3 +296,175 @@ def _reached(study: Any) -> str:
         f"On the study’s objective the search ends {percent(100 * (best / optimum - 1), 2)} above the "
         f"optimum, {number(optimum, 0)}, which Q = R = I itself reaches."
     )
+
+
+class Search(NamedTuple):
+    """Rows (effort, error) of the candidates that worked and of their front, and the named ones."""
+
+    points: np.ndarray
+    edge: np.ndarray
+    marks: dict[str, tuple[float, float]]
+
+
+def read_search(rows: Table, trade: Any) -> Search:
+    """What one read_search tried; `trade` names default weights and optimum, as far as they are known."""
+    worked = np.isfinite(rows["tracking_degC"]) & np.isfinite(rows["effort_percent"])
+    points = np.column_stack([rows["effort_percent"][worked], rows["tracking_degC"][worked]])
+    return Search(points, points[_rows_of_front(points)], _marks(points, rows["chosen"][worked], trade))
+
+
+def draw_search(tried: Search, head: str, small: str) -> PictureColumn:
+    """A read_search as a picture; in its place that nothing worked."""
+    if not len(tried.points):
+        gap = Missing("not measured", "no candidate of the read_search worked")
+        return PictureColumn(head, small, "", [page.hole(gap)])
+    return PictureColumn(head, small, "", [_panel_of_search(*tried, head)])
+
+
+def _marks(points: np.ndarray, chosen: np.ndarray, trade: Any) -> dict[str, tuple[float, float]]:
+    """(effort, error) of the chosen candidate, the default weights and
+    the optimum, as far as they are known."""
+    named = known(trade, {}).items()
+    at = {name: (place["effort_percent"], place["tracking_degC"]) for name, place in named if place}
+    return (
+        {"chosen": (float(points[chosen][0, 0]), float(points[chosen][0, 1]))} if chosen.any() else {}
+    ) | at
+
+
+def _rows_of_front(points: np.ndarray) -> np.ndarray:
+    """Rows of the front, by effort: those that no other beats in one figure without losing in the other."""
+    order = np.lexsort((points[:, 1], points[:, 0]))
+    least = np.minimum.accumulate(np.append(np.inf, points[order, 1]))[:-1]
+    return order[points[order, 1] < least]
+
+
+def _trade_in_words(name: str, marks: dict[str, tuple[float, float]]) -> str:
+    effort, error = marks[name]
+    return f"{short(error, 3)}{THIN}°C at {short(effort, 3)}{THIN}%"
+
+
+def _around(values: np.ndarray) -> charts.Axis:
+    room = 0.06 * (float(values.max() - values.min()) or 1.0)
+    return charts.linear(float(values.min()) - room, float(values.max()) + room, ticks=3)
+
+
+def _panel_of_search(
+    points: np.ndarray, edge: np.ndarray, marks: dict[str, tuple[float, float]], head: str
+) -> Markup:
+    every = np.array([*points, *marks.values()])
+    # far candidates would press the front against an axis: what lies
+    # beyond nine tenths of them is drawn at the edge
+    ends = [
+        (min(values.min(), named.min()), max(np.quantile(values, 0.9), named.max()))
+        for values, named in zip(points.T, np.array([*marks.values(), edge[0], edge[-1]]).T, strict=True)
+    ]
+    x, y = (_around(np.array(end)) for end in ends)
+    frame = charts.Frame(x, y, width=540, height=230, left=44, above=20, right=12)
+    inside = (points[:, 0] <= x.high) & (points[:, 1] <= y.high)
+    front_line = edge[(edge[:, 0] <= x.high) & (edge[:, 1] <= y.high)]
+    layers = [
+        charts.dots(frame, points[inside, 0], points[inside, 1], "try", 1.8),
+        charts.line(frame, front_line[:, 0], front_line[:, 1], "line", most=1000),
+    ]
+    if "default" in marks:
+        layers.append(charts.dots(frame, *marks["default"], "ring-end", 4.5))
+    if "optimum" in marks:
+        layers.append(charts.crosses(frame, [marks["optimum"][0]], [marks["optimum"][1]], size=4.5))
+    if "chosen" in marks:
+        a, b = float(frame.px(marks["chosen"][0])), float(frame.py(marks["chosen"][1]))
+        layers.append(
+            Markup('<rect class="picked-mark" x="{:.1f}" y="{:.1f}" width="8" height="8"/>').format(
+                a - 4, b - 4
+            )
+        )
+    # apart even where all three lie on one another
+    corners = {"chosen": ("end", -8, -7), "default": ("start", 8, -7), "optimum": ("end", -8, 15)}
+    for name, place in marks.items():
+        anchor, dx, dy = corners[name]
+        layers.append(charts.label(frame, *place, name, anchor=anchor, dx=dx, dy=dy))
+    out = len(every) - len(marks) - int(inside.sum())
+    alt = f"{head}: {len(points)} candidates, {len(edge)} on the front; " + "; ".join(
+        f"{name} {_trade_in_words(name, marks)} of effort" for name in marks
+    )
+    alt += f"; {count(out, 'candidate')} beyond the picture" if out else ""
+    return charts.panel(frame, layers, alt=alt, css="mb", title="°C", units=("%", "°C"))
+
+
+@instead(lambda gap: [gap.sentence()])
+def sentences(results: Mapping[str, Any] | Missing) -> list[str]:
+    """How often each controller was the best and won the pair, and which pair a changed prior gives."""
+    results = need(results)
+    answers = results["answers"]
+    told = [
+        f"{count(results['relearnings'], 'fresh record')} of the bundled simulated machine, each learned and "
+        f"judged from the beginning: the best was {_listed(answers['best'])}. The pair went to "
+        f"{_listed(answers['pair_winner'])}."
+    ]
+    for change, runs in results.get("prior", {}).items():
+        told.append(
+            f"With the prior of plant uncertainty {change} the pair went to {_listed(runs['pair_winner'])}."
+        )
+    return [*told, "No verdict, choice or export reads these figures."]
+
+
+def _listed(counts: Mapping[str, int]) -> str:
+    names = {name: "nobody" if name == "None" else in_a_sentence(name) for name in counts}
+    return ", ".join(f"{names[name]} in {number(times, 0)}" for name, times in counts.items())
+
+
+# ---- the course of a search
+
+
+def dots_and_line(rows: Table) -> str:
+    """The caption of a search's progress."""
+    failed = int(np.isnan(rows["cost"].astype(float)).sum())
+    return "Dots: candidates; line: best so far." + (
+        f" Vermillion at the foot: {count(failed, 'candidate')} that failed."
+        if failed
+        else " No candidate failed."
+    )
+
+
+def progress(rows: Table, head: str, small: str, level: Any, *, excess: bool) -> PictureColumn:
+    """The candidates of one search beside a level: of the default weights, or with `excess` of the known
+    optimum, above which the costs are then drawn in per cent."""
+    if not len(rows["cost"]) or gap_of(level):
+        none = Missing("not measured", "no search was recorded")
+        return PictureColumn(head, small, "", [page.hole(gap_of(level) or none)])
+    at, cost, best = (rows[name].astype(float) for name in ("evaluation", "cost", "incumbent"))
+    if excess:
+        cost, best = (100 * (values / level - 1) for values in (cost, best))
+    least = max(float(np.nanmin(best)), 1e-6)
+    frame = charts.Frame(
+        charts.linear(0, float(at[-1])),
+        charts.logarithmic(least, float(np.nanmax(cost))),
+        width=540,
+        height=190,
+        left=44,
+        above=20,
+    )
+    failed = at[np.isnan(cost)]
+    layers = [
+        charts.dots(frame, at, cost, "try", 1.8),
+        charts.line(frame, at, best, "line"),
+        charts.dots(frame, failed, np.full(len(failed), frame.y.low), "gone", 2),
+    ]
+    if not excess:
+        layers.append(charts.level(frame, level, "ref", f"default {short(level)}"))
+    end = float(best[-1])
+    layers.append(
+        charts.label(
+            frame,
+            float(at[-1]),
+            frame.y.high,
+            f"best {percent(end, 2)} above" if excess else f"best {short(end)}",
+            anchor="end",
+            dy=-6,
+        )
+    )
+    alt = f"{head}: after {count(len(at), 'evaluation')} " + (
+        f"the best is {percent(end, 2)} above the optimum"
+        if excess
+        else f"the best costs {short(end)}, the default weights {short(level)}"
+    )
+    return PictureColumn(head, small, "", [charts.panel(frame, layers, alt=alt, css="mb")])

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.verdict.controllers import heading
-from pipeline.verdict.evidence import Table, gap_of
+from pipeline.verdict.evidence import Table, known
 from pipeline.verdict.verdict import Missing
 
 # of one curve at most
@@ -28,8 +28,8 @@ def curves(tables: Mapping[str, Table | Missing]) -> dict[str, Curve]:
     return {
         name: curve
         for table, read in READERS.items()
-        if not gap_of(tables[table])
-        for name, curve in read(tables[table])
+        if (rows := known(tables[table], None))
+        for name, curve in read(rows)
         if curve.x
     }
 

@@ -18,16 +18,31 @@ from pipeline.report.shared.card import (
     entrant,
     in_order,
     of_verdict,
+    or_no_figures,
     step,
 )
+from pipeline.report.shared.difference import Change
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import FLOW_BAND
 from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
-from pipeline.verdict.digits import THIN, band, count
-from pipeline.verdict.evidence import gap_of, instead, need, need_figure, or_gap, or_nothing
+from pipeline.verdict.digits import MINUS, THIN, band, count, number
+from pipeline.verdict.evidence import (
+    Absent,
+    entry,
+    gap_of,
+    instead,
+    known,
+    lookup,
+    need,
+    need_figure,
+    or_empty,
+    or_gap,
+    or_nothing,
+)
 from pipeline.verdict.setpoint import (
     Board,
     Case,
+    Cell,
     Harm,
     bars,
     board,
@@ -39,7 +54,7 @@ from pipeline.verdict.setpoint import (
     within,
     worst,
 )
-from pipeline.verdict.verdict import FAILED, PASSED, Figure, Missing, Verdict
+from pipeline.verdict.verdict import FAILED, PASSED, Figure, Missing, Question, Verdict, state
 
 MOVES = "Nozzle camera to setpoints"
 # cases that the picture has room for, the worst first
@@ -48,20 +63,21 @@ MOST_CASES = 8
 
 def card(sources: Sources, verdict: Verdict) -> Card:
     """Settling, staying and harm of the three."""
-    scores, next_step = board(sources.evidence, sources.subject("setpoint")), _step(verdict)
-    gap = gap_of(scores)
-    if gap or not verdict.winner:
-        return of_verdict(verdict, MOVES, next_step, missing=gap.sentence() if gap else verdict.reason)
+    return of_verdict(verdict, MOVES, _step(verdict), **_figures(sources, verdict))
+
+
+@or_no_figures
+def _figures(sources: Sources, verdict: Verdict) -> dict[str, Any]:
+    scores = need(board(sources.evidence, sources.subject("setpoint")))
+    if not verdict.winner:
+        raise Absent(Missing("not measured", verdict.reason))
     names, asked = shown(scores), sources.declared.rules
     limits = bars(sources.evidence, scores)
     harms = [harm_of(scores, name, limits) for name in names]
     limit = next((harm.limit for harm in harms if isinstance(harm, Harm)), None)
-    return of_verdict(
-        verdict,
-        MOVES,
-        next_step,
-        entrants=[entrant(role(scores, name), name, scores.kinds[name]) for name in names],
-        rows=[
+    return {
+        "entrants": [entrant(role(scores, name), name, scores.kinds[name]) for name in names],
+        "rows": [
             _shares("Settles", scores, names, "settled", asked.settled_percent),
             _shares("Stays", scores, names, "stay", asked.stay_percent),
             {
@@ -70,11 +86,11 @@ def card(sources: Sources, verdict: Verdict) -> Card:
                 "cells": _harm_cells(harms, limit),
             },
         ],
-        basis=f"Worst case; small: 95{THIN}% interval",
-        cost=_cost(sources),
-        picture=deciding(sources, verdict),
-        sources=sources.source("scoreboard"),
-    )
+        "basis": f"Worst case; small: 95{THIN}% interval",
+        "cost": _cost(sources),
+        "picture": deciding(sources, verdict),
+        "sources": sources.source("scoreboard"),
+    }
 
 
 def shown(scores: Board) -> list[str]:
@@ -227,3 +243,39 @@ def _lane(frame: charts.Frame, at: float, figure: Figure, css: str) -> Markup:
         css, low, high, y, y
     )
     return Markup("{}{}").format(bar, charts.mark(css, f"{middle:.1f}", y))
+
+
+# points closer than this are one: the accepted figures are kept rounded
+SAME = 0.05
+
+
+def change(sources: Sources, case: Case, cell: Cell | None) -> Change:
+    """How the settled runs of the default moved since the accepted run: beyond noise where the
+    interval of the one and as wide a one about the other do not overlap."""
+    if not known(sources.accepted, None) or cell is None or not isinstance(cell.settled, Figure):
+        return Change("first run")
+    stage = lookup(sources.accepted, "metrics.evaluate_setpoint")
+    before = entry(stage, str(entry(stage, "default")), *case, "settled")
+    if before is None:
+        return Change("new")
+    now = cell.settled
+    points = now.value - before
+    if abs(points) < SAME:
+        return Change("unchanged")
+    # the accepted figure has the interval of today's: of as many runs, clustered as they are
+    if now.low <= before + now.high - now.value and before - (now.value - now.low) <= now.high:
+        return Change("within noise")
+    question = Question(0, "", "Settled", "%", sources.declared.rules.settled_percent, True, "")
+    text = (
+        f"{'+' if points > 0 else MINUS}{number(abs(points), 1)}{THIN}points · "
+        f"{'better' if points > 0 else 'worse'}"
+    )
+    return Change(text, moved=True, worse=points < 0 and state(question, now) == FAILED)
+
+
+@or_empty
+def changes(sources: Sources) -> list[tuple[str, Change]]:
+    """Every case of the default that counts, with how its settled runs moved."""
+    scores = need(board(sources.evidence, sources.subject("setpoint")))
+    counting = scores.counting(scores.default) if scores.default else []
+    return [(within(case), change(sources, case, cell)) for case, cell in counting]

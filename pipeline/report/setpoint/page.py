@@ -5,8 +5,7 @@ from typing import Any
 
 from pipeline.report.deposition.page import flat
 from pipeline.report.setpoint import agent as setpoint_agent
-from pipeline.report.setpoint import by_flow as setpoint_by_flow
-from pipeline.report.setpoint import change as setpoint_change
+from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.setpoint import deciding as setpoint_deciding
 from pipeline.report.setpoint import harm as setpoint_harm
 from pipeline.report.setpoint import vision as setpoint_vision
@@ -111,7 +110,7 @@ def render(sources: Sources) -> str:
         guesses=setpoint_agent.guesses(sources),
         agent_made=setpoint_agent.kept_sentence(),
         good_named=good_named(sources),
-        by_flow=setpoint_by_flow.by_flow(sources),
+        by_flow=setpoint_vision.by_flow(sources),
         yardsticks=setpoint_vision.yardsticks(sources),
         reliability=setpoint_vision.reliability(sources),
         confusion=setpoint_vision.confusion(sources),
@@ -194,7 +193,7 @@ def answers(sources: Sources, scores: Board) -> list[dict[str, Any]]:
                 "strip": charts.strip(lost, shown),
                 "stay": _stay(own),
                 "stay_bad": states[1] == FAILED,
-                "change": setpoint_change.change(sources, case, own),
+                "change": setpoint_card.change(sources, case, own),
                 "decides": case == lowest,
             }
         )

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from markupsafe import Markup
 
+from pipeline.verdict.evidence import instead
 from pipeline.verdict.verdict import Verdict
 
 # letters of a reason that a card has room for in the widest font
@@ -72,6 +73,9 @@ def of_verdict(verdict: Verdict, moves: str, step: dict[str, str], **rest: Any) 
         "step": step,
         "missing": "",
     } | rest
+
+
+or_no_figures = instead(lambda gap: {"missing": gap.sentence()})
 
 
 def best_of(values: Sequence[float | None], *, at_least: bool) -> float | None:

@@ -11,8 +11,8 @@ from markupsafe import Markup
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.card import PICTURE, Card, Deciding, cell, entrant, in_order, of_verdict, step
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature.deciding import runs_of, until_settled
 from pipeline.report.temperature.judgement import Judgement, named_before
+from pipeline.report.temperature.pictures import runs_of, until_settled
 from pipeline.temperature.controllers.table import BY_NAME
 from pipeline.verdict.controllers import heading
 from pipeline.verdict.digits import THIN, count, short

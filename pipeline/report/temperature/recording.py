@@ -74,10 +74,13 @@ def _excitation(sources: Sources) -> Picture:
     )
 
 
+NO_FLAGS: Table = dict.fromkeys(("signal", "start_s", "end_s", "kind"), np.empty(0, object))
+
+
 @as_picture("record", "The record, with what was flagged and masked")
 def record(sources: Sources) -> Picture:
     """Every signal of the record, what is masked and what was found strange."""
-    table, quality = need(sources.tables["record"]), known(sources.tables["quality"], None)
+    table, quality = need(sources.tables["record"]), known(sources.tables["quality"], NO_FLAGS)
     machine, time = sources.declared.machine, _elapsed(table, sources.declared.machine.sample_time_s)
     set_points = known(sources.tables["set_points"], {})
     masked_total = 0
@@ -136,7 +139,7 @@ def _signal(
     time: np.ndarray,
     values: np.ndarray,
     masked: np.ndarray,
-    quality: Table | None,
+    quality: Table,
     set_point: np.ndarray | None,
     *,
     last: bool,
@@ -159,7 +162,7 @@ def _signal(
     layers += [charts.line(frame, time, np.where(masked, np.nan, values), "line thin")]
     stretches = charts.stretches(masked)
     layers += [charts.interval(frame, float(time[a]), float(time[b - 1]), "gone") for a, b in stretches[:200]]
-    mine = np.flatnonzero(quality["signal"] == signal.name) if quality else []
+    mine = np.flatnonzero(quality["signal"] == signal.name)
     # a flag that spans the record says where it is in words, not in grey over everything
     short_ones = [i for i in mine if quality["end_s"][i] - quality["start_s"][i] < 0.5 * float(time[-1])]
     layers = [

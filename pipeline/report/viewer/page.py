@@ -13,8 +13,8 @@ from pipeline.report.certificate import exported
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources, copies
-from pipeline.report.temperature.deciding import degrees, runs_of, until_settled
 from pipeline.report.temperature.judgement import Judgement
+from pipeline.report.temperature.pictures import degrees_axis, runs_of, until_settled
 from pipeline.report.viewer import packed, series
 from pipeline.verdict.controllers import heading
 from pipeline.verdict.digits import THIN, number, short
@@ -45,14 +45,14 @@ def render(sources: Sources, judged: Judgement) -> Viewer:
         table = sources.tables["every_lesson" if shown.name == "lessons" else shown.name]
         if table is OFF:
             continue
-        row = {"title": shown.title, "note": shown.note, "rows": "", "link": "", "size": "", "source": ""}
-        row |= {"missing": gap_of(table), "left_out": ""}
+        row: dict[str, Any] = {"title": shown.title, "note": shown.note, "missing": gap_of(table)}
+        row |= dict.fromkeys(("rows", "link", "size", "source", "left_out"), "")
         rows.append(row)
         if row["missing"]:
             continue
         source = sources.source(shown.name)[0]
         link, size = source.link, packed.size_of(source)
-        found = packed.packed(shown, table, room)
+        found = packed.packed(shown, need(table), room)
         room -= sum(map(len, found.files.values()))
         files |= found.files
         if found.entry["books"]:
@@ -127,7 +127,7 @@ def still(sources: Sources, judged: Judgement) -> dict[str, Any]:
     early = {who: rows[time[rows] <= seconds] for who, rows in runs.items()}
     frame = charts.Frame(
         charts.linear(0, seconds or 1.0),
-        degrees(table, np.concatenate(list(early.values())), zone),
+        degrees_axis(table, np.concatenate(list(early.values())), zone),
         width=360,
         height=240,
         left=44,
