@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from pipeline.verdict import identification
 from pipeline.verdict.controllers import YARDSTICKS, heading, in_a_sentence
 from pipeline.verdict.digits import with_unit
-from pipeline.verdict.evidence import Evidence, Figures, entry
+from pipeline.verdict.evidence import Evidence, Figures, entry, gap_of
 from pipeline.verdict.pairs import pair_names, pair_sentence, reference_of
 from pipeline.verdict.rules import judge, rows
 from pipeline.verdict.settings import ReportRules
@@ -267,9 +267,8 @@ def _beaten(figures: Figures, held: Mapping[str, Standing]) -> str:
 def _nothing(evidence: Evidence, words: Words, drift: Figure | Missing, named: str) -> Verdict:
     a, b = pair_names(evidence.figures)
     lines = _lines(*(_standing(evidence, name, drift).rules for name in (a, b)))
-    gap = evidence.figures.get("evaluate_temperature")
     nobody = f"{name_first(named)} was not judged" if named else "No contestant was judged"
-    why = gap if isinstance(gap, Missing) else Missing(OPEN, nobody)
+    why = gap_of(evidence.figures.get("evaluate_temperature")) or Missing(OPEN, nobody)
     first = next(iter(groups()))
     return Verdict(
         LOOP,
@@ -305,7 +304,7 @@ def _passed(
         if winner.name == incumbent != best and best
         else ""
     )
-    later = "" if everything or not isinstance(drift.figure, Missing) else _drift_sentence(drift)
+    later = "" if everything else _drift_sentence(drift)
     next_step = (
         "Next: a supervised trial, somebody at the machine throughout."
         if recorded
@@ -373,10 +372,9 @@ def _worst_case(figures: Figures, name: str, rule: Rule) -> str:
 
 
 def _drift_sentence(rule: Rule) -> str:
-    figure = rule.figure
-    if not isinstance(figure, Missing):
-        return ""
-    return figure.sentence() if rule.state == FAILED else f"Drift is {rule.state}. {figure.sentence()}"
+    gap = gap_of(rule.figure)
+    told = gap.sentence() if gap else ""
+    return told if not gap or rule.state == FAILED else f"Drift is {rule.state}. {told}"
 
 
 def _closest_limit(standing: Standing) -> str:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.verdict.digits import THIN, band, count, decimals, number, quantity, short
-from pipeline.verdict.evidence import Evidence, lookup, need, need_figure
+from pipeline.verdict.evidence import Evidence, entry, gap_of, instead, known, lookup, need, need_figure
 from pipeline.verdict.rules import Reading, at_path, judge, rows
 from pipeline.verdict.verdict import (
     FAILED,
@@ -158,26 +158,22 @@ def fits(evidence: Evidence) -> list[Fit]:
 def fit_figure(model: Any, key: str, name: str) -> Figure | Missing:
     """The fit `key` of an output in percent, with its band."""
     value = lookup(model, f"{key}.{name}")
-    if isinstance(value, Missing):
-        if isinstance(model, Missing) or key not in ("fit_holdout_ahead", "fit_holdout_held"):
-            return value
+    if gap := gap_of(value):
+        if gap_of(model) or key not in ("fit_holdout_ahead", "fit_holdout_held"):
+            return gap
         return Missing(
             "not measured",
             "no stretch of the hold-out outlasts the start-up of the prediction",
             "Record longer, or lower ahead_steps",
         )
-    ends = lookup(model, f"{key}_band.{name}")
-    return Figure(value, *([value, value] if isinstance(ends, Missing) else ends))
+    return Figure(value, *known(lookup(model, f"{key}_band.{name}"), [value, value]))
 
 
+@instead(lambda gap: "ahead")
 def ahead_words(evidence: Evidence) -> str:
     """ "60 s ahead"."""
-    steps = lookup(evidence.figures["identify_plant"], "ahead_steps")
-    return (
-        "ahead"
-        if isinstance(steps, Missing)
-        else f"{steps * evidence.machine.sample_time_s:g}{THIN}s\u00a0ahead"
-    )
+    steps = need_figure(evidence.figures["identify_plant"], "ahead_steps")
+    return f"{steps * evidence.machine.sample_time_s:g}{THIN}s\u00a0ahead"
 
 
 def percent_of(figure: Figure | Missing) -> str:
@@ -305,8 +301,8 @@ def _signed(value: float) -> str:
 def _excitation(evidence: Evidence, question: Question) -> Reading:
     model = evidence.figures["identify_plant"]
     rank, full = need_figure(model, "excitation.rank"), need_figure(model, "excitation.full")
-    lags, poor = lookup(model, "excitation.lags"), ""
-    if rank < full and not isinstance(lags, Missing):
+    lags, poor = entry(model, "excitation", "lags"), ""
+    if rank < full and lags is not None:
         weak = [key for key, part in model["excitation"]["inputs"].items() if part["rank"] < lags]
         poor = (
             f" Too poor on its own: {_listed(weak)}."
