@@ -703,17 +703,6 @@ def _lead(state: str, first: Rule | None, judged: int, *, condition: bool) -> st
     return f"All {count(judged, 'rule')} {'that can be judged ' if condition else ''}passed."
 
 
-def _peak(evidence: Evidence) -> float:
-    """The largest command of our laws over the steady one; 0 where none was learned."""
-    learning = evidence.figures["train_ilc"]
-    learned = (
-        []
-        if isinstance(learning, Missing)
-        else [laws[law] for laws in learning.values() for law in ("model_inverse", "pixels") if law in laws]
-    )
-    return max((law["peak_over_steady"] for law in learned), default=0.0)
-
-
 def _summary(parts: Sequence[Structure], use: str, machine: bool) -> str:
     """The composer in use with its worst figure, in % of on-off control's, and its worst line."""
     found = worst(parts, use)
@@ -746,20 +735,15 @@ def _bare(name: str) -> str:
 def _price(evidence: Evidence, parts: Sequence[Structure]) -> str:
     """What the signals cost: trials, peak command, what the paper's law would have done,
     and the lines that the priority rule would lose."""
-    learning, sentences = evidence.figures["train_ilc"], []
-    if not isinstance(learning, Missing):
-        learned = [
-            laws[law] for laws in learning.values() for law in ("model_inverse", "pixels") if law in laws
-        ]
-        routines = max((len(laws.get("other_routines", [])) for laws in learning.values()), default=0)
-        if learned:
-            trials, peak = max(law["trials"] for law in learned), _peak(evidence)
-            of = (
-                f"{count(routines, 'routine')} of {trials + 1} trials" if routines else f"{trials + 1} trials"
-            )
-            sentences.append(
-                f"Price: {of} for each material, and commands up to {number(peak, 0)} times the steady one."
-            )
+    learning, sentences = known(evidence.figures["train_ilc"], {}).values(), []
+    learned = [laws[law] for laws in learning for law in ("model_inverse", "pixels") if law in laws]
+    if learned:
+        routines = max(len(laws.get("other_routines", [])) for laws in learning)
+        trials, peak = (max(law[key] for law in learned) for key in ("trials", "peak_over_steady"))
+        of = f"{count(routines, 'routine')} of {trials + 1} trials" if routines else f"{trials + 1} trials"
+        sentences.append(
+            f"Price: {of} for each material, and commands up to {number(peak, 0)} times the steady one."
+        )
     before = gamma(evidence)
     if before:
         safe = before["gamma_worst"] < 1
@@ -769,12 +753,8 @@ def _price(evidence: Evidence, parts: Sequence[Structure]) -> str:
             f"above 1 on {percent(before['gamma_above_1_percent'], 2)}: "
             f"{'it may be run' if safe else 'do not run it'} on this machine."
         )
-    conformance = evidence.tables["conformance"]
-    short = (
-        {}
-        if isinstance(conformance, Missing)
-        else {part: report.get("shorter_than_lead", 0) for part, report in conformance.items()}
-    )
+    reports = known(evidence.tables["conformance"], {})
+    short = {part: report.get("shorter_than_lead", 0) for part, report in reports.items()}
     sentences += [
         f"{count(n, 'line', 'lines').capitalize()} of {part} {'is' if n == 1 else 'are'} shorter than the "
         f"lead: the priority rule would not print {'it' if n == 1 else 'them'}."

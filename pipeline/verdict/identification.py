@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.verdict.digits import THIN, band, count, decimals, number, quantity, short
+from pipeline.verdict.digits import THIN, band, count, decimals, listed, number, quantity, short
 from pipeline.verdict.evidence import Evidence, entry, gap_of, instead, known, lookup, need, need_figure
 from pipeline.verdict.rules import Reading, at_path, judge, rows
 from pipeline.verdict.verdict import (
@@ -129,12 +129,8 @@ def _decision(uses: Mapping[str, str]) -> str:
     ]
     return (
         "Trust this model "
-        f"{_listed(good)}{''.join(f', {word} {_listed(group)}' for word, group in groups if group)}."
+        f"{listed(good)}{''.join(f', {word} {listed(group)}' for word, group in groups if group)}."
     )
-
-
-def _listed(items: Sequence[str]) -> str:
-    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
 
 
 # ---- the figures
@@ -305,7 +301,7 @@ def _excitation(evidence: Evidence, question: Question) -> Reading:
     if rank < full and lags is not None:
         weak = [key for key, part in model["excitation"]["inputs"].items() if part["rank"] < lags]
         poor = (
-            f" Too poor on its own: {_listed(weak)}."
+            f" Too poor on its own: {listed(weak)}."
             if weak
             else " Each is rich enough alone, but they move alike."
         )
@@ -318,7 +314,7 @@ def _effects(evidence: Evidence, question: Question) -> Reading:
     signed = f"{int(table['seen'].sum())} of {len(table['seen'])}"
     names = [signal.name for signal in evidence.machine.inputs]
     blind = [name for name in names if not table["seen"][table["input"] == name].any()]
-    words = {"signed": signed, "inputs": _listed(blind) if blind else ""}
+    words = {"signed": signed, "inputs": listed(blind) if blind else ""}
     return count_of(len(blind)), {**words, "text": f"{blind[0]}: sign unknown" if blind else signed}
 
 

@@ -20,20 +20,12 @@ ANOTHER = "The accepted run is of another machine: nothing to compare."
 NAMED = 2
 
 
-class Moved(NamedTuple):
-    """A figure that moved beyond its noise: what it is, by how much ("+0.39 °C · worse"), and whether that is
-    worse."""
-
-    title: str
-    text: str
-    worse: bool
-
-
 class LoopChange(NamedTuple):
-    """One loop: the figures that moved, of how many that both runs have"""
+    """One loop: the figures that moved beyond their noise ("settled error +0.39 °C · worse"), of how many
+    that both runs have."""
 
     loop: str
-    moved: Sequence[Moved]
+    moved: Sequence[str]
     of: int
 
     def sentence(self) -> str:
@@ -42,8 +34,8 @@ class LoopChange(NamedTuple):
             return "nothing to compare with."
         if not self.moved:
             return f"no figure of {self.of} moved beyond its noise."
-        listed = "; ".join(f"{one.title} {one.text}" for one in self.moved[:NAMED])
         more = f"; and {len(self.moved) - NAMED} more" if len(self.moved) > NAMED else ""
+        listed = "; ".join(self.moved[:NAMED])
         return f"{len(self.moved)} of {count(self.of, 'figure')} moved: {listed}{more}."
 
 
@@ -94,14 +86,14 @@ def of_loops(sources: Sources, judged: Judgement) -> list[LoopChange]:
         for name, move in mine
         if move.moved
     ]
-    streams = deposition_moves(sources)
+    streams = deposition_card.moves(sources, known(structures(sources.evidence), []))
     cases = setpoint_card.changes(sources)
     loops = [
         LoopChange("temperature", temperature, _both([move for _, move in mine])),
         LoopChange("deposition", [_moved(move) for move in streams if move.moved], _both(streams)),
         LoopChange(
             "setpoint",
-            [Moved(name, change.text, change.worse) for name, change in cases if change.moved],
+            [f"{name} {change.text}" for name, change in cases if change.moved],
             sum(change.text not in ("first run", "new") for _, change in cases),
         ),
     ]
@@ -113,14 +105,9 @@ def _both(moves: Sequence[Move]) -> int:
     return sum(move.before is not None and isinstance(move.now, Figure) for move in moves)
 
 
-def _moved(move: Move, whose: str = "") -> Moved:
+def _moved(move: Move, whose: str = "") -> str:
     title = f"{move.question.title}{whose}"
-    return Moved(f"{title[:1].lower()}{title[1:]}", move.text(), move.word == "worse")
-
-
-def deposition_moves(sources: Sources) -> list[Move]:
-    """Flow errors of the composer in use, stream by stream."""
-    return deposition_card.moves(sources, known(structures(sources.evidence), []))
+    return f"{title[:1].lower()}{title[1:]} {move.text()}"
 
 
 def inputs(changed: Difference) -> str:

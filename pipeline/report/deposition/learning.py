@@ -3,7 +3,7 @@ and after, what the camera saw and what was measured from it."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -274,53 +274,39 @@ def _pause(trial: Table) -> tuple[float, float]:
     return float(trial["time_s"][on[gaps[0]]]), float(trial["time_s"][on[gaps[0] + 1]])
 
 
-class Story(NamedTuple):
-    """One column of the corner: its head, what it is, mark and class, the law, and whether its last trial is
-    drawn or its first."""
-
-    head: str
-    small: str
-    mark: str
-    css: str
-    law: str
-    after: bool
-
-
 @as_picture("corner", "Flow around the corner, before and after learning")
 def corner(sources: Sources) -> Picture:
     """Wanted and true flow around the pause, before and after."""
     table = need(sources.tables["lessons"])
     materials, laws = _materials(table), _laws(table)
     kind = "measured_mm3_per_s" if real(sources) else "true_mm3_per_s"
-    stories = [Story("On\u2011off control", "before learning: trial 0", "baseline", "bl", laws[-1], False)]
-    stories += [Story(*LAWS[law][:2], LAWS[law][3], LAWS[law][2], law, True) for law in laws]
-    # the worse material's error, in % of a full line's flow
-    errors: dict[tuple[str, bool], float] = {}
+    # the worse material's error, in % of a full line's flow: of on-off control, and after learning by a law
+    errors: dict[str, float] = {}
 
-    def draw(story: Story, column: int) -> list[Markup]:
+    def draw(law: str, column: int) -> list[Markup]:
         panels = []
         for i, material in enumerate(materials):
-            trials = _trials(table, material, story.law)["trial"]
+            trials = _trials(table, material, law or laws[-1])["trial"]
             if not len(trials):
                 continue
-            mine = _trial(table, material, story.law, int(trials.max()) if story.after else 0)
+            mine = _trial(table, material, law or laws[-1], int(trials.max()) if law else 0)
             error, panel = _corner_panel(
-                mine, mine[kind], story, material, column == i == 0, i == len(materials) - 1
+                mine, mine[kind], law, material, column == i == 0, i == len(materials) - 1
             )
-            key = (story.law, story.after)
-            errors[key] = max(errors.get(key, 0.0), error)
+            errors[law] = max(errors.get(law, 0.0), error)
             panels.append(panel)
         return panels
 
     shown = [
-        PictureColumn(story.head, story.small, story.mark, draw(story, i)) for i, story in enumerate(stories)
+        PictureColumn("On\u2011off control", "before learning: trial 0", "baseline", draw("", 0)),
+        *(PictureColumn(*LAWS[law][:2], LAWS[law][3], draw(law, i)) for i, law in enumerate(laws, 1)),
     ]
     after = [
-        f"{LAWS[law][0][:1].lower()}{LAWS[law][0][1:]} {percent(errors[law, True], 2)}"
+        f"{LAWS[law][0][:1].lower()}{LAWS[law][0][1:]} {percent(errors[law], 2)}"
         for law in laws
-        if (law, True) in errors
+        if law in errors
     ]
-    before = errors.get((laws[-1], False))
+    before = errors.get("")
     return Picture(
         f"Through the corner on\u2011off control misses the wanted flow by {percent(before or 0.0, 2)} of a "
         f"full line; after the last trial: {', '.join(after)}, the worse material each.",
@@ -341,9 +327,10 @@ def corner(sources: Sources) -> Picture:
 
 
 def _corner_panel(
-    mine: Table, flow: np.ndarray, story: Story, material: str, titled: bool, bottom: bool
+    mine: Table, flow: np.ndarray, law: str, material: str, titled: bool, bottom: bool
 ) -> tuple[float, Markup]:
-    """r.m.s. error in % of a full line's flow around the pause, and the flow drawn beside the wanted one."""
+    """r.m.s. error in % of a full line's flow around the pause, and the flow drawn beside the wanted one,
+    after learning by a law; before it if there is none."""
     begin, end = _pause(mine)
     near = (mine["time_s"] >= begin - 1.0) & (mine["time_s"] <= end + 1.5)
     t, flow, wanted = mine["time_s"][near] - begin, flow[near], mine["wanted_mm3_per_s"][near]
@@ -363,13 +350,13 @@ def _corner_panel(
         charts.line(frame, t, flow),
         charts.label(frame, frame.x.high, top, text, anchor="end", dy=8),
     ]
-    when = "After" if story.after else "Before"
+    when = f"After learning, {LAWS[law][0]}" if law else "Before learning, on-off control"
     panel = charts.panel(
         frame,
         layers,
-        alt=f"{when} learning, {LAWS[story.law][0] if story.after else 'on-off control'}, material "
-        f"{material}: the flow misses the wanted one by {percent(error, 2)} of a full line, r.m.s.",
-        css=story.css,
+        alt=f"{when}, material {material}: the flow misses the wanted one by {percent(error, 2)} of a full "
+        "line, r.m.s.",
+        css=LAWS[law][2] if law else "bl",
         title="mm³/s" if titled else "",
         x_ticks=bottom,
         units=("s", "mm³/s"),

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.digits import THIN, band, count, decimals, number, short
+from pipeline.verdict.digits import THIN, band, count, decimals, listed, number, short
 from pipeline.verdict.evidence import (
     Absent,
     Table,
@@ -57,7 +57,7 @@ def loop_state(sources: Sources) -> dict[str, Any]:
         answering = [name for name, p in p_values.items() if p < level] or [min(p_values, key=p_values.get)]
         largest = max(p_values[name] for name in answering)
         test = (
-            f"{_listed(answering)} {'answers' if len(answering) == 1 else 'answer'} past errors of the "
+            f"{listed(answering)} {'answers' if len(answering) == 1 else 'answer'} past errors of the "
             f"outputs ({_p(largest)}), as a controller does."
         )
         head = "Recorded in closed loop."
@@ -99,10 +99,6 @@ def _p(value: float) -> str:
     return "p below 0.000001" if value < LEAST_P else f"p = {short(value, 2)}"
 
 
-def _listed(items: Sequence[str]) -> str:
-    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
-
-
 # ---- gains that physics forbids
 
 
@@ -117,7 +113,7 @@ def flagged(sources: Sources) -> dict[str, Any]:
     if not heaters:
         reason = "no input is declared to heat, so no sign is known to be wrong"
         raise Absent(Missing("not applicable", reason, "Set heats: true for heaters in plant.inputs"))
-    finding = f"None: every effect of {_listed(heaters)} is one that a heater can have."
+    finding = f"None: every effect of {listed(heaters)} is one that a heater can have."
     if gains:
         finding = f"{flagged_sentence(gains)} {flagged_remedy(gains)}"
     return {"finding": finding, "rows": [_flagged_row(gain) for gain in gains]}
@@ -158,7 +154,7 @@ def chosen_rows(sources: Sources) -> list[tuple[str, str]]:
 def _feedthrough(direct: dict[str, bool]) -> str:
     outputs = [name for name, free in direct.items() if free]
     return (
-        f"{_listed(outputs)}, {len(outputs)} of {count(len(direct), 'output')}" if outputs else "in no output"
+        f"{listed(outputs)}, {len(outputs)} of {count(len(direct), 'output')}" if outputs else "in no output"
     )
 
 
@@ -192,7 +188,7 @@ def fit_table(sources: Sources, fits: Sequence[Fit]) -> dict[str, Any]:
     moved = [f"{row['cost']} in {row['name']}" for row in rows if row["sure"]]
     if moved:
         finding = (
-            f"A free mean gains {_listed(moved)}: the level moved up to the hold-out, as another ambient or "
+            f"A free mean gains {listed(moved)}: the level moved up to the hold-out, as another ambient or "
             "operating point moves it. Record what does so as one of plant.disturbances."
         )
     elif any(row["known"] for row in rows):

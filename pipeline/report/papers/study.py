@@ -2,7 +2,7 @@
 and the parity search."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -263,12 +263,12 @@ def _parity(results: Mapping[str, Any] | Missing) -> Picture:
     """The best cost so far above the optimum that is known, and what the candidates trade."""
     table, study = _table(results, "parity"), need_figure(results, "figures")
     optimum = lookup(study, "parity.optimum")
-    head, tried = "The study’s objective", read_search(table, lookup(study, "parity.trade"))
+    head, trade = "The study’s objective", lookup(study, "parity.trade")
     return Picture(
         _reached(study),
         [
             progress(table, head, "excess over the optimum in %, log", optimum, excess=True),
-            draw_search(tried, "What its candidates trade", "state known, discounted"),
+            draw_search(table, trade, "What its candidates trade", "state known, discounted"),
         ],
         f"{dots_and_line(table)} Beside it: r.m.s. tracking error in °C, up, against r.m.s. "
         "effort in per cent, across; line: the front; filled square: chosen; cross: the optimum, Q = R = I.",
@@ -298,27 +298,17 @@ def _reached(study: Any) -> str:
     )
 
 
-class Search(NamedTuple):
-    """Rows (effort, error) of the candidates that worked and of their front, and the named ones."""
-
-    points: np.ndarray
-    edge: np.ndarray
-    marks: dict[str, tuple[float, float]]
-
-
-def read_search(rows: Table, trade: Any) -> Search:
-    """What one read_search tried; `trade` names default weights and optimum, as far as they are known."""
+def draw_search(rows: Table, trade: Any, head: str, small: str) -> PictureColumn:
+    """What one search tried, effort across and error up; in its place that nothing worked. `trade` names
+    default weights and optimum, as far as they are known."""
     worked = np.isfinite(rows["tracking_degC"]) & np.isfinite(rows["effort_percent"])
     points = np.column_stack([rows["effort_percent"][worked], rows["tracking_degC"][worked]])
-    return Search(points, points[_rows_of_front(points)], _marks(points, rows["chosen"][worked], trade))
-
-
-def draw_search(tried: Search, head: str, small: str) -> PictureColumn:
-    """A read_search as a picture; in its place that nothing worked."""
-    if not len(tried.points):
-        gap = Missing("not measured", "no candidate of the read_search worked")
+    if not len(points):
+        gap = Missing("not measured", "no candidate of the search worked")
         return PictureColumn(head, small, "", [page.hole(gap)])
-    return PictureColumn(head, small, "", [_panel_of_search(*tried, head)])
+    marks = _marks(points, rows["chosen"][worked], trade)
+    panel = _panel_of_search(points, points[_rows_of_front(points)], marks, head)
+    return PictureColumn(head, small, "", [panel])
 
 
 def _marks(points: np.ndarray, chosen: np.ndarray, trade: Any) -> dict[str, tuple[float, float]]:

@@ -24,19 +24,6 @@ MOST_SENTENCES = 200
 SHARES = (("p_under", "too-little"), ("p_good", "flag"), ("p_over", "too-much"))
 
 
-class Strip(NamedTuple):
-    """One episode: its name, its finding, its panels, and its decisions in words, of which `more` are not
-    shown."""
-
-    id: str
-    head: str
-    controller: str
-    finding: str
-    panels: list[Markup]
-    rows: list[str]
-    more: int
-
-
 class Held(NamedTuple):
     """Windows begin to end - 1, held for one reason."""
 
@@ -67,7 +54,9 @@ def reason(why: str) -> str:
     return why.rsplit("held: ", 1)[-1].strip()
 
 
-def _strip(mine: Table, name: str, i: int) -> Strip:
+def _strip(mine: Table, name: str, i: int) -> dict[str, Any]:
+    """One episode: its name, its finding, its panels, and its decisions in words, of which `more` are not
+    shown."""
     t = mine["time_s"]
     edges = np.append(t, t[-1] + (t[-1] - t[-2] if len(t) > 1 else 1.0))
     x = charts.linear(float(t[0]), float(edges[-1]), ticks=10)
@@ -91,15 +80,15 @@ def _strip(mine: Table, name: str, i: int) -> Strip:
     moved = (mine["flow_move_percent"] != 0) | (mine["temperature_move_degC"] != 0)
     sentences = [str(text) for text in mine["why"][moved | mine["held"]]]
     panels = [_shares(mine, x, edges, held), _flow(mine, x, held, edges), _temperature(mine, x)]
-    return Strip(
-        f"why-{i}",
-        name,
-        str(mine["controller"][0]),
-        finding,
-        [*panels, _moves(mine, x)],
-        sentences[:MOST_SENTENCES],
-        len(sentences[MOST_SENTENCES:]),
-    )
+    return {
+        "id": f"why-{i}",
+        "head": name,
+        "controller": str(mine["controller"][0]),
+        "finding": finding,
+        "panels": [*panels, _moves(mine, x)],
+        "rows": sentences[:MOST_SENTENCES],
+        "more": len(sentences[MOST_SENTENCES:]),
+    }
 
 
 def _alike(mine: Table) -> list[tuple[int, int]]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.verdict.digits import number
+from pipeline.verdict.digits import number, power_of_ten
 from pipeline.verdict.verdict import FAILED, Figure, Missing, Question, share, state
 
 
@@ -137,11 +137,7 @@ def logarithmic(low: float, high: float, *, every: int = 0) -> Axis:
 
 
 def _power(k: int) -> str:
-    return (
-        number(10.0**k, max(-k, 0))
-        if -3 <= k <= 4
-        else "10" + str(k).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    )
+    return number(10.0**k, max(-k, 0)) if -3 <= k <= 4 else power_of_ten(k)
 
 
 class Frame(NamedTuple):

@@ -3,7 +3,7 @@ moved since the accepted run."""
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pipeline.report.shared.difference import Difference, Move, difference, moves
 from pipeline.report.shared.sources import Sources
@@ -18,7 +18,7 @@ from pipeline.verdict.decide import (
     standings,
     undeclared_outputs,
 )
-from pipeline.verdict.digits import count, short
+from pipeline.verdict.digits import count, listed, short
 from pipeline.verdict.evidence import Figures, entry
 from pipeline.verdict.night import Drift, drift, in_production
 from pipeline.verdict.pairs import pair_names, pair_sentence, reference_of
@@ -92,82 +92,54 @@ def named_before(sources: Sources) -> str:
     return str(sources.accepted.get("winner") or "")
 
 
-class RuleLine(NamedTuple):
-    """A rule with the number of its answers, and its state for the two contestants that are shown."""
-
-    rule: str
-    answers: str
-    states: tuple[str, ...]
-    first: bool
+def heads(names: Sequence[str]) -> list[dict[str, str]]:
+    """The contestants above columns of rules or figures."""
+    return [{"mark": name, "name": heading(name), "kind": kind(name)} for name in names]
 
 
-class RulesHead(NamedTuple):
-    """The contestant above a column of rules or answers."""
-
-    mark: str
-    name: str
-    kind: str
-
-
-class VerdictParts(NamedTuple):
-    """The head of the page: decision, reason, remedy, rules, and what changed since the accepted run."""
-
-    state: str
-    decision: str
-    lead: str
-    reason: str
-    remedy: str
-    heads: list[RulesHead]
-    rules: list[RuleLine]
-    claim: str
-    changed: str
-
-
-def heads(judged: Judgement) -> list[RulesHead]:
-    return [RulesHead(name, heading(name), kind(name)) for name in (judged.subject, judged.rival)]
-
-
-def verdict_parts(judged: Judgement, *, claim: str = "") -> VerdictParts:
-    """The verdict in words; `claim` says under which condition it holds."""
+def verdict_parts(judged: Judgement, *, claim: str = "") -> dict[str, Any]:
+    """The head of the page: decision, reason, remedy, rules with the numbers of their answers and their
+    states for the two contestants, and what changed since the accepted run; `claim` says under which
+    condition it holds."""
     verdict = judged.verdict
     rules = [
-        RuleLine(
-            line[0].name[:1].upper() + line[0].name[1:],
-            groups()[line[0].name][1],
-            tuple(rule.state for rule in line),
-            first=line[0].name == verdict.rule,
-        )
+        {
+            "rule": line[0].name[:1].upper() + line[0].name[1:],
+            "answers": groups()[line[0].name][1],
+            "states": [rule.state for rule in line],
+            "first": line[0].name == verdict.rule,
+        }
         for line in verdict.rules
     ]
     parameters = judged.changed.parameters if judged.changed else []
     changed = f"{count(len(parameters), 'parameter').capitalize()} changed since the accepted run"
-    return VerdictParts(
-        verdict.word,
-        verdict.decision,
-        verdict.lead,
-        verdict.reason,
-        verdict.remedy,
-        heads(judged),
-        rules,
-        claim,
-        changed if parameters else "",
-    )
-
-
-def shown(judged: Judgement) -> dict[str, dict[str, dict[str, float | None]]]:
-    """The figures of the pages as numbers, for the metrics: later runs are held against them."""
     return {
-        name: {
-            key: {"median": _plain(f.value), "low": _plain(f.low), "high": _plain(f.high)}
-            for key, f in answers.items()
-            if isinstance(f, Figure)
-        }
-        for name, answers in judged.answers.items()
+        "state": verdict.word,
+        "decision": verdict.decision,
+        "lead": verdict.lead,
+        "reason": verdict.reason,
+        "remedy": verdict.remedy,
+        "heads": heads((judged.subject, judged.rival)),
+        "rules": rules,
+        "claim": claim,
+        "changed": changed if parameters else "",
     }
 
 
-def _plain(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def shown(judged: Judgement) -> dict[str, dict[str, dict[str, float | None]]]:
+    """The figures of the pages as numbers, for the metrics: later runs are held against them. None is
+    without end."""
+    return {
+        name: {
+            key: {
+                end: value if math.isfinite(value) else None
+                for end, value in zip(("median", "low", "high"), figure[:3], strict=True)
+            }
+            for key, figure in answers.items()
+            if isinstance(figure, Figure)
+        }
+        for name, answers in judged.answers.items()
+    }
 
 
 def deciding_sentence(figures: Figures, winner: str | None) -> str:
@@ -202,7 +174,7 @@ def best_sentence(figures: Figures, held: Mapping[str, Standing], winner: str | 
         for name, standing in held.items()
         if standing.passes and name != winner and name not in YARDSTICKS
     ]
-    beside = f"; {_listed(others)} {'passes' if len(others) == 1 else 'pass'} too" if others else ""
+    beside = f"; {listed(others)} {'passes' if len(others) == 1 else 'pass'} too" if others else ""
     cheapest = entry(comparison(figures), "best")
     if cheapest in held and cheapest != winner:
         return (
@@ -223,7 +195,3 @@ def _ahead(figures: Figures, winner: str) -> str:
         return f", {short(percent, 2)}\u00a0% cheaper than {nearest}"
     chance = f", the simplest; {nearest} is cheaper by no more than chance"
     return chance if percent < 0 else f"; {nearest} is next"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

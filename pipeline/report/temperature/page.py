@@ -63,7 +63,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         verdict=verdict_parts(judged, claim=headline.claim(sources, ("temperature",))),
         answers=answer_rows(sources, judged),
         setting=scorecard.setting(comparison(sources.metrics)),
-        heads=heads(judged),
+        heads=heads((judged.subject, judged.rival)),
         drift=judged.drifted,
         drift_state=drift_state(judged),
         accepted_on=accepted_on(sources),

@@ -7,8 +7,8 @@ from typing import Any
 
 from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature.judgement import Judgement
-from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading, in_a_sentence, kind
+from pipeline.report.temperature.judgement import Judgement, heads
+from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading, in_a_sentence
 from pipeline.verdict.digits import THIN, count, number, short
 from pipeline.verdict.evidence import Absent, entry, gap_of, need
 from pipeline.verdict.temperature import comparison, finite, names, refused, unstable
@@ -53,12 +53,15 @@ def scorecard(sources: Sources, judgement: Judgement, words: Mapping[str, str]) 
     asked = {question.key: question for question in (*judgement.asked, *UNRULED)}
     rows = [_row(sources, asked[key], judged, judgement, words.get(key, "")) for key in ORDER if key in asked]
     return {
-        "heads": [{"mark": name, "name": heading(name), "kind": kind(name)} for name in judged],
+        "heads": heads(judged),
         "rows": rows,
         "caption": _caption(sources),
         "below": [
             *filter(None, [_gap(compared, judged), _at_bound(compared, judged), _broken(compared, judged)]),
-            *_refused(sources),
+            *(
+                f"{heading(name)[:1].upper()}{heading(name)[1:]} is refused: {why.rstrip('.')}."
+                for name, why in refused(metrics).items()
+            ),
         ],
     }
 
@@ -234,13 +237,6 @@ def _broken(compared: Mapping[str, Any], names: list[str]) -> str:
         if parts
         else ""
     )
-
-
-def _refused(sources: Sources) -> list[str]:
-    return [
-        f"{heading(name)[:1].upper()}{heading(name)[1:]} is refused: {why.rstrip('.')}."
-        for name, why in refused(sources.metrics).items()
-    ]
 
 
 def infeasible(sources: Sources) -> list[str]:
