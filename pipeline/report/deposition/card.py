@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.report.deposition.marks import KIND, MARK, real
-from pipeline.report.deposition.parts import draw_flows
+from pipeline.report.deposition.parts import draw_flows, lines_of
 from pipeline.report.shared import page
 from pipeline.report.shared.card import (
     PICTURE,
@@ -167,12 +167,12 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     finding = (
         f"{part.part}, material {part.material}, about the largest error; dashed: wanted flow. {listed}."
     )
-    seen = [f"{name}_mm3_per_s" for name in ("wanted", *drawn)]
+
     return Deciding(
         finding,
         draw_flows(stretch, drawn, finding, PICTURE),
         "",
-        page.in_viewer("signals", part=[part.part], material=[part.material], y=seen),
+        page.in_viewer("signals", part=[part.part], material=[part.material], y=lines_of(drawn)),
     )
 
 

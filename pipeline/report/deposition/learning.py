@@ -315,7 +315,7 @@ def corner(sources: Sources) -> Picture:
         "began, in s; dashed: wanted.",
         page.origin(
             sources.source("lessons"),
-            material=materials,
+            material=materials[:1],
             routine=_routines(table),
             law=laws,
             trial=sorted(

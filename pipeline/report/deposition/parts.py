@@ -115,7 +115,7 @@ def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Pi
         f"±{100 * RIGHT:g}{THIN}%, dots and dark beyond ±{100 * FAR:g}{THIN}% of a full line’s flow; "
         "of a long part the worst of each stretch. "
         f"{'Forecast.' if real(sources) else 'True flow of the simulated machine.'}",
-        page.origin(sources.source("signals"), part=part),
+        page.origin(sources.source("signals"), part=part, y=lines_of((_library(sources), OURS, BASELINE))),
         f"part-{i}",
         part,
     )
@@ -249,8 +249,13 @@ def stretches(sources: Sources) -> Picture:
         f"{'Forecast' if real(sources) else 'True'} flow in mm³/s against time in s, "
         f"the {STRETCH_S:g} s around the largest error of the signal that was chosen; dashed: wanted; "
         f"{', '.join(f'{k} {NAMES[name].lower()}' for k, name in enumerate(names, 1))}.",
-        page.origin(sources.source("signals")),
+        page.origin(sources.source("signals"), y=lines_of(names)),
     )
+
+
+def lines_of(names: Sequence[str]) -> list[str]:
+    """The wanted flow and that of these composers, as the table of signals calls them."""
+    return [f"{name}_mm3_per_s" for name in ("wanted", *names)]
 
 
 class Stretch(NamedTuple):

@@ -28,7 +28,6 @@ MIDDLE = (10, 90)
 ROUNDING = 1e-3
 # width, height and the room left, below, above and right of a panel, in px
 SIZE = (568, 300, 34, 20, 22, 12)
-STYLES = {"dd": "line dd", "mb": "line", "bl": "line bl"}
 
 
 class Trace(NamedTuple):
@@ -175,7 +174,7 @@ def _flow(board: Board, found: Traces, frame: charts.Frame, *, alt: str, page_on
     """Median and middle of the runs of everybody who acts, and each run that is left alone. On page one the
     marks stand below the picture."""
     layers: list[Markup] = []
-    styles = _styles(board, found)
+    styles = page.line_styles({name: role(board, name) for name in found.runs})
     # what is left alone lies behind, the default in front
     for name in reversed(list(found.runs)):
         flow = found.runs[name].flow
@@ -211,7 +210,7 @@ def _inside(board: Board, found: Traces, limit: float) -> Markup:
     y = charts.Axis(0, 104, tuple((float(v), str(v)) for v in (0, 25, 50, 75, 100)))
     frame = charts.Frame(_decisions(found), y, *SIZE)
     layers = [charts.level(frame, limit, "lim", f"to settle: {limit:g}", above=False)]
-    styles, ends = _styles(board, found), []
+    styles, ends = page.line_styles({name: role(board, name) for name in found.runs}), []
     for name in reversed(list(found.runs)):
         share = 100 * found.runs[name].inside.mean(axis=0)
         layers.append(charts.line(frame, *corners(share), styles[name], steps=True))
@@ -219,15 +218,6 @@ def _inside(board: Board, found: Traces, limit: float) -> Markup:
     layers += [*_event(frame, found.clog), *_key(frame, board, found)]
     alt = f"Runs inside at the end: {', '.join(ends[::-1])}; {limit:g} % are to settle"
     return charts.panel(frame, layers, alt=alt, css="mb wide", title="inside, %", units=("decisions", "%"))
-
-
-def _styles(board: Board, found: Traces) -> dict[str, str]:
-    """A line each; the second of a hue is dashed."""
-    styles: dict[str, str] = {}
-    for name in found.runs:
-        style = STYLES[page.MARKS[role(board, name)]]
-        styles[name] = f"{style} dash" if style in styles.values() else style
-    return styles
 
 
 def _event(frame: charts.Frame, happens: Clog | None) -> list[Markup]:

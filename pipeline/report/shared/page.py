@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import re
 import urllib.parse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jinja2
 from markupsafe import Markup, escape
@@ -133,6 +133,19 @@ def mark(controller: str) -> Markup:
             'aria-hidden="true"></span>'
         ).format(css, SHAPES[css])
     return Markup('<span class="mk {}" aria-hidden="true"></span>').format(css)
+
+
+STYLES = {"dd": "line dd", "mb": "line", "bl": "line bl"}
+
+
+def line_styles(marks: Mapping[str, str]) -> dict[str, str]:
+    """{controller: the class of its line}, from the role or the name that has its mark; the second of a hue
+    is dashed."""
+    styles: dict[str, str] = {}
+    for name, role in marks.items():
+        style = STYLES.get(MARKS.get(role, "bl"), "line")
+        styles[name] = f"{style} dash" if style in styles.values() else style
+    return styles
 
 
 def bdi(text: object) -> Markup:

@@ -28,7 +28,6 @@ PI, IDLE = ("pi_simc", "pi"), "hold"
 FIGURES = ("settled_error", "settling")
 NOT_JUDGED = Missing(OPEN, "It was not judged")
 WITHOUT_GCODE = "printed_file"  # what ingest flags: the file of a print is not beside the log
-STYLES = {"dd": "line dd", "mb": "line", "bl": "line bl"}
 
 
 def card(sources: Sources, judged: Judgement, verdict: Verdict) -> Card:
@@ -125,8 +124,11 @@ def _step(sources: Sources, verdict: Verdict) -> dict[str, str]:
 
 
 @or_gap
-def deciding(sources: Sources, judged: Judgement, size: tuple[int, int] = PICTURE) -> Deciding | Missing:
-    """The output furthest from its reference in the deciding case, a line a contestant."""
+def deciding(
+    sources: Sources, judged: Judgement, size: tuple[int, int] = PICTURE, lead: str = ""
+) -> Deciding | Missing:
+    """The output furthest from its reference in the deciding case, a line a contestant; `lead` begins the
+    finding."""
     table = need(sources.tables["trajectories"])
     runs, zone = runs_of(sources, judged, table)
     if not runs:
@@ -138,7 +140,8 @@ def deciding(sources: Sources, judged: Judgement, size: tuple[int, int] = PICTUR
         who: float(np.abs(table[zone] - table[f"{zone}_reference"])[rows[-1]]) for who, rows in runs.items()
     }
     listed = ", ".join(f"{i} {heading(who)} {short(end, 2)}" for i, (who, end) in enumerate(ends.items(), 1))
-    finding = f"{label[:1].upper()}{label[1:]} ends off its reference by, in °C: {listed}. Grey: the limit."
+    finding = f"{lead}{label[:1].upper()}{label[1:]} ends off its reference by, in °C: {listed}."
+    finding = f"{finding} Grey: the limit."
     return Deciding(
         finding,
         _drawn(table, early, zone, sources.declared.rules.settled_error_degC, finding, size),
@@ -161,11 +164,10 @@ def _drawn(
         charts.linear(0, float(time[rows].max()) or 1.0), charts.Axis(0.01, most, ticks, True),
         *size, 40, 34, 22, 14,
     )  # fmt: skip
-    layers, used = [charts.level(frame, limit, "lim")], set()
+    layers, styles = [charts.level(frame, limit, "lim")], page.line_styles({who: who for who in runs})
     for i, (who, mine) in enumerate(runs.items(), 1):
-        style, y = STYLES.get(page.MARKS.get(who, "bl"), "line"), np.maximum(off[mine], 0.01)
-        layers.append(charts.line(frame, time[mine], y, style + (" dash" if style in used else ""), most=120))
-        used.add(style)
+        y = np.maximum(off[mine], 0.01)
+        layers.append(charts.line(frame, time[mine], y, styles[who], most=120))
         # a number of its own height each, where the line comes by
         at = int(np.argmax(np.log(y) <= np.log(y[0]) + (np.log(0.1) - np.log(y[0])) * i / (len(runs) + 1)))
         layers.append(charts.label(frame, time[mine[at]], y[at], str(i), dx=5, dy=4))

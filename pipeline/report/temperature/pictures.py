@@ -53,6 +53,7 @@ def _case(sources: Sources, judgement: Judgement, name: str) -> Picture:
         who: _past(run, [o.name for o in sources.declared.machine.outputs], settled)
         for who, run in runs.items()
     }
+    _, zone = ends.get(judgement.subject, next(iter(ends.values())))
     whole, runs = runs, _early(runs, next(q.limit for q in judgement.asked if q.key == "settling"))
     y = _temperatures(sources, list(runs.values()))
     most = max(
@@ -76,15 +77,8 @@ def _case(sources: Sources, judgement: Judgement, name: str) -> Picture:
         shown,
         f"{_extent(whole, runs)}Above: true temperature of every zone in °C, dashed its reference. Below: "
         "every command in per cent as the machine was given it; grey: within its limits. Against time in s.",
-        page.origin(sources.source("trajectories"), **_viewed(sources, name, list(runs))),
+        page.origin(sources.source("trajectories"), case_name=name, contestant=list(runs), y=zone),
     )
-
-
-def _viewed(sources: Sources, name: str, contestants: list[str]) -> dict[str, list[str]]:
-    """The same in the viewer: every zone's temperature and every command as given."""
-    machine = sources.declared.machine
-    lines = [o.name for o in machine.outputs] + [f"{i.name}_applied" for i in machine.inputs]
-    return {"case_name": [name], "contestant": contestants, "y": lines, "p": ["unit"]}
 
 
 def _early(runs: dict[str, Table], settling_s: float) -> dict[str, Table]:
@@ -376,13 +370,3 @@ def until_settled(table: Table, runs: dict[str, np.ndarray], zone: str) -> float
         return float(time.max())
     outside = time[away > 0.02 * away.max()]
     return float(min(3 * outside.max(initial=0.0) + 1, time.max()))
-
-
-def degrees_axis(table: Table, rows: np.ndarray, zone: str) -> charts.Axis:
-    """Room for a zone and its reference; what is lost runs along the edge."""
-    values = np.concatenate([table[zone][rows], table[f"{zone}_reference"][rows]])
-    values = values[np.isfinite(values) & (np.abs(values) < 1e4)]
-    if not len(values):
-        return charts.linear(0, 1)
-    room = 0.05 * float(np.ptp(values)) or 1.0
-    return charts.linear(float(values.min()) - room, float(values.max()) + room)

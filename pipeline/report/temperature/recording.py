@@ -74,6 +74,7 @@ def _excitation(sources: Sources) -> Picture:
     )
 
 
+LINES = 8  # that a link into the viewer opens at most
 NO_FLAGS: Table = dict.fromkeys(("signal", "start_s", "end_s", "kind"), np.empty(0, object))
 
 
@@ -114,7 +115,7 @@ def record(sources: Sources) -> Picture:
             + (" Dashed: what the output was to be." if set_points else "")
         ),
         page.origin(
-            sources.source("record", "quality"), y=[s.name for s in (*machine.acting, *machine.outputs)]
+            sources.source("record", "quality"), y=[output.name for output in machine.outputs][:LINES]
         ),
     )
 
