@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report.deposition.marks import KIND, MARK, real
-from pipeline.report.deposition.parts import draw_flows, lines_of
+from pipeline.report.deposition.parts import KIND, MARK, draw_flows, lines_of, real
 from pipeline.report.shared import page
 from pipeline.report.shared.card import (
     PICTURE,

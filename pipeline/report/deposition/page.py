@@ -13,7 +13,7 @@ from markupsafe import Markup
 from pipeline.report.deposition import card as deposition_card
 from pipeline.report.deposition import learning as deposition_learning
 from pipeline.report.deposition import parts as deposition_parts
-from pipeline.report.deposition.marks import HEADS, KIND, MARK, PAPER, real
+from pipeline.report.deposition.parts import HEADS, KIND, MARK, PAPER, real
 from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Change, Move
 from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table

@@ -4,7 +4,7 @@ cost, what changed since the accepted run, what to do next, and which file to lo
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.report.about import changes
+from pipeline.report.about import page as about_page
 from pipeline.report.certificate import exported
 from pipeline.report.deposition import card as deposition_card
 from pipeline.report.setpoint import card as setpoint_card
@@ -22,7 +22,7 @@ from pipeline.verdict.verdict import FAILED, PASSED, Verdict
 def render(sources: Sources, judged: Judgement) -> str:
     """The text of index.html."""
     loops, verdicts = headline.loops(sources), sources.verdicts
-    told = changes.changes(sources, judged)
+    told = about_page.changes(sources, judged)
     return page.render(
         "index.html",
         here="index",

@@ -5,9 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.report.about.changes import ANOTHER, changes
-from pipeline.report.runs.curves import READERS, Curve, curves, restored
-from pipeline.report.runs.figures import LOOPS, RunFigures, asked, measured
+from pipeline.report.about.page import ANOTHER, changes
+from pipeline.report.runs.figures import LOOPS, READERS, Curve, RunFigures, asked, curves, measured, restored
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.difference import accepted_on, changed_parameters, move
 from pipeline.report.shared.sources import Sources

@@ -7,7 +7,6 @@ from pipeline.report.deposition.page import flat
 from pipeline.report.setpoint import agent as setpoint_agent
 from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.setpoint import deciding as setpoint_deciding
-from pipeline.report.setpoint import harm as setpoint_harm
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
 from pipeline.report.shared import charts, page, words
@@ -99,7 +98,7 @@ def render(sources: Sources) -> str:
         deciding=setpoint_deciding.picture(sources, scores),
         boards=boards(sources, judged_scores) if judged_scores else [],
         worsts=worsts(judged_scores) if judged_scores else [],
-        harms=setpoint_harm.harms(sources, scores),
+        harms=setpoint_agent.harms(sources, scores),
         why_default=choice_sentence(sources),
         ways=setpoint_agent.ways(sources, scores),
         strips=setpoint_why.strips(sources),

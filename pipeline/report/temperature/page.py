@@ -7,7 +7,7 @@ from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import accepted_on
 from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature import pictures, recording, scorecard
+from pipeline.report.temperature import pictures, scorecard
 from pipeline.report.temperature.card import deciding
 from pipeline.report.temperature.judgement import Judgement, heads, verdict_parts
 from pipeline.verdict.controllers import BY_NAME, heading
@@ -75,8 +75,8 @@ def render(sources: Sources, judged: Judgement) -> str:
         at_work=[worst_zone(sources, judged), pictures.plants(sources), pictures.record_length(sources)],
         cases=[pictures.case(sources, judged, name) for name in ("typical", "deciding")],
         findings=findings(sources),
-        record=[recording.excitation(sources), recording.record(sources)],
-        flaws=recording.flaws(sources),
+        record=[pictures.excitation(sources), pictures.record(sources)],
+        flaws=pictures.flaws(sources),
         panel=scorecard.declared_panel(sources),
         weights=scorecard.weights(sources),
         trusted=sources.model,
