@@ -390,7 +390,9 @@ def _closest_limit(standing: Standing) -> str:
     ]
     if not asked:
         return ""
-    question, figure = min(asked, key=lambda pair: -share(pair[0], _worst_end(*pair)))
+    question, figure = max(
+        asked, key=lambda pair: share(pair[0], pair[1].low if pair[0].at_least else pair[1].high)
+    )
     places = places_of(question, [figure])
     whose = " of the weakest tenth of plants" if question.key in MARGINS else ""
     return (
@@ -411,10 +413,6 @@ def _worst_margins(compared: Mapping[str, Any], winner: Standing) -> str:
             least = with_unit(question.limit, question.unit, 2)
             parts.append(f"{question.rule} {with_unit(worst, question.unit, 2)} of {least}")
     return f"Below the limit on the worst plant: {', '.join(parts)}." if parts else ""
-
-
-def _worst_end(question: Question, figure: Figure) -> float:
-    return figure.low if question.at_least else figure.high
 
 
 # ---- the model first

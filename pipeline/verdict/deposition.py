@@ -11,7 +11,7 @@ from pipeline import statistics
 from pipeline.deposition.controllers import COMPOSERS as TABLE
 from pipeline.verdict.digits import THIN, band, count, number, percent, short
 from pipeline.verdict.evidence import Evidence, Figures, gap_of, instead, known, lookup, need, or_gap
-from pipeline.verdict.rules import Reading, Row, at_path, judge, rows
+from pipeline.verdict.rules import Reading, ask, rows
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import (
     FAILED,
@@ -342,20 +342,13 @@ def rules(evidence: Evidence, parts: Sequence[Structure], beside: str = LIBRARY)
 def rules_of(case: Parts, beside: str = LIBRARY) -> tuple[Pair, ...]:
     """The drive first, then what may be believed. If the drive cannot follow, a signal is held against the
     best that any command could reach within it, else against the flow that is wanted."""
-    asked = {key: row for key, row in rows(LOOP).items() if key != "near" or case.bound}
-    return tuple((_rule(case, key, row, OURS), _rule(case, key, row, beside)) for key, row in asked.items())
+    asked = [key for key in rows(LOOP) if key != "near" or case.bound]
+    return tuple((_rule(case, key, OURS), _rule(case, key, beside)) for key in asked)
 
 
-def _rule(case: Parts, key: str, row: Row, composer: str) -> Rule:
-    question = row.question(key, row.limit(case.evidence.rules))
-
-    def read() -> Reading:
-        if key in FIGURES:
-            return FIGURES[key](case, composer)
-        path = row.figure.format(controller=composer)
-        return at_path(case.evidence.figures, path, at_least=question.at_least), {}
-
-    rule = judge(row, question, read)
+def _rule(case: Parts, key: str, composer: str) -> Rule:
+    own = FIGURES.get(key)
+    rule = ask(LOOP, key, case.evidence, own and (lambda question: own(case, composer)), composer)
     gap = gap_of(rule.figure)
     if gap and gap.state == UNJUDGED:
         return rule._replace(question=None)

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.verdict.digits import THIN, band, count, decimals, listed, number, quantity, short
 from pipeline.verdict.evidence import Evidence, entry, gap_of, instead, known, lookup, need, need_figure
-from pipeline.verdict.rules import Reading, at_path, judge, rows
+from pipeline.verdict.rules import Reading, ask, rows
 from pipeline.verdict.verdict import (
     FAILED,
     PASSED,
@@ -44,7 +44,8 @@ class Fit(NamedTuple):
 def trust(evidence: Evidence) -> Verdict:
     """Which uses the model is good for. A use is passed if each rule that it needs is passed."""
     ahead = ahead_words(evidence)
-    rules = {key: _rule(evidence, key) for key in rows(LOOP) if key != GAINS or _heaters(evidence)}
+    heats = any(signal.heats for signal in evidence.machine.inputs)
+    rules = {key: _rule(evidence, key) for key in rows(LOOP) if key != GAINS or heats}
     uses = {
         words: worst_state([rule.state for key, rule in rules.items() if _needed(key, rule, use)])
         for use, words in (
@@ -96,22 +97,14 @@ def _needed(key: str, rule: Rule, use: str) -> bool:
 
 
 def _rule(evidence: Evidence, key: str) -> Rule:
-    row = rows(LOOP)[key]
+    row, own = rows(LOOP)[key], FIGURES.get(key)
     if key == AHEAD:
         words = ahead_words(evidence)
         row = row.model_copy(update={"name": words[:1].upper() + words[1:]})
-    question = row.question(key, row.limit(evidence.rules))
-
-    def read() -> Reading:
-        if key in FIGURES:
-            return FIGURES[key](evidence, question)
-        return at_path(evidence.figures, row.figure, at_least=question.at_least), {}
-
-    rule = judge(row, question, read)
+    rule = ask(LOOP, key, evidence, own and (lambda question: own(evidence, question)), row=row)
     if isinstance(rule.figure, Figure):
-        asked = rule.question or question
-        undecided = rule.state == UNDECIDED and asked.unit == "%"
-        return rule._replace(remedy=_longer(asked, rule.figure)) if undecided else rule
+        undecided = rule.state == UNDECIDED and row.unit == "%"
+        return rule._replace(remedy=_longer(rule.question, rule.figure)) if undecided else rule
     gap = rule.figure
     remedy = gap.remedy and gap.remedy.rstrip(".") + "."
     return rule._replace(reason=gap.reason.rstrip(".") + ".", remedy=remedy)
@@ -253,10 +246,11 @@ def _residuals(evidence: Evidence, rows: np.ndarray) -> Reading:
     worst, excess = _worst_lag(table, rows)
     if worst is None:
         return count_of(0), {}
+    correlation = float(table["correlation"][worst])
     words = {
         "output": table["output"][worst],
         "input": table["against"][worst],
-        "correlation": _signed(table["correlation"][worst]),
+        "correlation": f"{'+' if correlation > 0 else ''}{number(correlation, 2)}",
         "lag": int(table["lag"][worst]),
         "times": short(excess, 2),
     }
@@ -290,10 +284,6 @@ def _worst_lag(table: Mapping[str, np.ndarray], rows: np.ndarray) -> tuple[int |
     return int(excess.argmax()), float(excess.max())
 
 
-def _signed(value: float) -> str:
-    return ("+" if value > 0 else "") + number(float(value), 2)
-
-
 def _excitation(evidence: Evidence, question: Question) -> Reading:
     model = evidence.figures["identify_plant"]
     rank, full = need_figure(model, "excitation.rank"), need_figure(model, "excitation.full")
@@ -324,11 +314,6 @@ def _stability(evidence: Evidence, question: Question) -> Reading:
     refinement = evidence.params.get("identify_plant", {}).get("refinement")
     case = "validated" if refinement == "validated" else "other"
     return count_of(radius), {"pole": pole, "text": f"largest pole {pole}", "case": case}
-
-
-def _heaters(evidence: Evidence) -> list[str]:
-    """Inputs that are declared to heat."""
-    return [signal.name for signal in evidence.machine.inputs if signal.heats]
 
 
 def _gains(evidence: Evidence, question: Question) -> Reading:

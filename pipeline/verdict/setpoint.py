@@ -23,7 +23,7 @@ from pipeline.verdict.evidence import (
     need_figure,
     or_gap,
 )
-from pipeline.verdict.rules import Reading, Row, at_path, judge, rows
+from pipeline.verdict.rules import Reading, ask, rows
 from pipeline.verdict.verdict import (
     CERTIFICATE,
     FAILED,
@@ -228,23 +228,17 @@ def of_classifier(rule: Rule) -> bool:
 def rules(evidence: Evidence, board: Board | None) -> tuple[Pair, ...]:
     names = (board.learned(), board.baseline()) if board else ("", "")
     return tuple(
-        (_rule(evidence, board, key, row, names[0], 0), _rule(evidence, board, key, row, names[1], 1))
-        for key, row in rows(LOOP).items()
+        (_rule(evidence, board, key, names[0], 0), _rule(evidence, board, key, names[1], 1))
+        for key in rows(LOOP)
     )
 
 
-def _rule(evidence: Evidence, board: Board | None, key: str, row: Row, name: str, column: int) -> Rule:
-    question = row.question(key, row.limit(evidence.rules))
-
-    def read() -> Reading:
-        if key in CONTROL:
-            return CONTROL[key](evidence, board, name)
-        if key in SEEING:
-            return SEEING[key](evidence, column)
-        path = row.figure.format(controller=name)
-        return at_path(evidence.figures, path, at_least=question.at_least), {}
-
-    return judge(row, question, read, undecided)
+def _rule(evidence: Evidence, board: Board | None, key: str, name: str, column: int) -> Rule:
+    if control := CONTROL.get(key):
+        return ask(LOOP, key, evidence, lambda question: control(evidence, board, name), name, undecided)
+    seeing = SEEING.get(key)
+    own = seeing and (lambda question: seeing(evidence, column))
+    return ask(LOOP, key, evidence, own, name, undecided)
 
 
 class Harm(NamedTuple):
@@ -485,13 +479,19 @@ def verdict(evidence: Evidence) -> Verdict:
     if first is None:
         return settled
     failed = first.state == FAILED
+    # a rule of the classifier holds whoever controls
+    reason = (
+        f"{first.reason} By runs that settle and stay {name} comes closest."
+        if of_classifier(first)
+        else f"Judged is {name}: {first.reason[:1].lower()}{first.reason[1:]}"
+    )
     return settled._replace(
         winner=None if refusal else scores.default,
         subject=scores.default,
         state=ended,
         decision=words.of(ended),
         lead=f"First {'failed' if failed else 'undecided'} rule: {first.name[:1].lower()}{first.name[1:]}.",
-        reason=_closest(name, first),
+        reason=reason,
         remedy=_conditions(asked, claim == CLAIM),
         rule=first.name,
     )
@@ -536,15 +536,6 @@ def _conditions(asked: Sequence[Rule], rendered: bool) -> str:
     real = " Recordings of the real printer: none are in (datasets/raw/setpoint)." if rendered else ""
     remedies = dict.fromkeys(rule.remedy for rule in short if rule.remedy)
     return f"Before it may: {', '.join(figures)}.{real} To try: {' '.join(remedies)}"
-
-
-def _closest(name: str, rule: Rule) -> str:
-    """Who comes closest, and how far it is off; a rule of the classifier holds whoever controls."""
-    return (
-        f"{rule.reason} By runs that settle and stay {name} comes closest."
-        if of_classifier(rule)
-        else f"Judged is {name}: {rule.reason[:1].lower()}{rule.reason[1:]}"
-    )
 
 
 def named(board: Board, name: str) -> str:

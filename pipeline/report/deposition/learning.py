@@ -2,7 +2,7 @@
 and after, what the camera saw and what was measured from it."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -56,10 +56,6 @@ def _trials(table: Table, material: str, law: str) -> Table:
     return {name: values[rows] for name, values in table.items()}
 
 
-def _columns(laws: list[str], draw: Callable[[str, int], list[Markup]]) -> list[PictureColumn]:
-    return [PictureColumn(*LAWS[law][:2], LAWS[law][3], draw(law, i)) for i, law in enumerate(laws)]
-
-
 # ---- error against trial
 
 
@@ -91,7 +87,7 @@ def errors(sources: Sources) -> Picture:
             if material in curves[law]
         ]
 
-    shown = _columns(laws, draw)
+    shown = [PictureColumn(*LAWS[law][:2], LAWS[law][3], draw(law, i)) for i, law in enumerate(laws)]
     text = "; ".join(
         f"{LAWS[law][0]} ends at {', '.join(_ends(sources, law, of_law))}"
         for law, of_law in curves.items()

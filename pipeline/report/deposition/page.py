@@ -293,10 +293,6 @@ def flat(data: Any, name: str = "") -> list[tuple[str, str]]:
 # ---- the library
 
 
-def _step(sources: Sources) -> float:
-    return float(known(lookup(sources.tables["learned"], "sample_time_s"), math.nan))
-
-
 @as_picture("signals", "Its signals")
 def signals(sources: Sources) -> Picture:
     """Each basis signal from its lead to its end, materials beside one another."""
@@ -473,7 +469,8 @@ def columns(sources: Sources) -> dict[str, Any]:
     """The matrix (3), a row for each of its columns."""
     table = need(sources.tables["library"])
     library = pd.DataFrame(table)
-    rows = [_signal(row, _step(sources)) for row in library.head(MOST).itertuples()]
+    Ts = float(known(lookup(sources.tables["learned"], "sample_time_s"), math.nan))
+    rows = [_signal(row, Ts) for row in library.head(MOST).itertuples()]
     return {"rows": rows, "more": max(len(library) - MOST, 0)}
 
 

@@ -225,7 +225,9 @@ def _pairs(sources: Sources) -> dict[str, Any]:
     """The first-order table, output by output; of many inputs the strongest of each output."""
     table = need(sources.tables["first_order"])
 
-    gaps = _gaps(table, _horizon(sources))
+    # the longest time after a step that the step responses show
+    horizon = known(sources.tables["steps"], {"time_s": np.array([np.inf])})["time_s"].max()
+    gaps = _gaps(table, float(horizon))
     outputs = [_output_pairs(table, gaps, output.name) for output in sources.declared.machine.outputs]
     fitted = sum(not gap for gap in gaps)
     every = f"of {count(len(gaps), 'pair')}"
@@ -256,11 +258,6 @@ def shortened_list(names: list[str]) -> str:
     """The first names, and how many more there are."""
     shown = ", ".join(names[:MOST_INPUTS])
     return shown + (f" and {len(names) - MOST_INPUTS} more" if len(names) > MOST_INPUTS else "")
-
-
-def _horizon(sources: Sources) -> float:
-    """The longest time after a step that the step responses show, in s."""
-    return float(known(sources.tables["steps"], {"time_s": np.array([np.inf])})["time_s"].max())
 
 
 def _gaps(table: Table, horizon: float) -> list[str]:

@@ -104,7 +104,11 @@ def _parts(a: Run | None, b: Run, rules: ReportRules) -> dict[str, Any]:
         ]
         if another and loop == "temperature":
             rows = [row | {"change": "another machine", "moved": False} for row in rows]
-        loops.append((_head(loop, before, now), rows))
+        # by run whose figures they are, with the verdict
+        names = [run.controllers.get(loop) for run in (before, now)]
+        who = [heading(name) if name else "" for name in names]
+        verdicts = [run.verdicts.get(loop, "") for run in (before, now)]
+        loops.append(({"loop": loop, "who": who, "verdicts": verdicts}, rows))
     differing = list(changed_parameters(a.parameters, b.parameters)) if a else []
     return {
         "names": (a.name if a else "Accepted run", b.name),
@@ -139,15 +143,6 @@ def _signals(run: Run) -> list[set]:
 
 
 # ---- figures
-
-
-def _head(loop: str, before: RunFigures, now: RunFigures) -> dict[str, Any]:
-    """A loop, and by run whose figures they are with the verdict."""
-    return {
-        "loop": loop,
-        "who": [heading(run.controllers[loop]) if run.controllers.get(loop) else "" for run in (before, now)],
-        "verdicts": [run.verdicts.get(loop, "") for run in (before, now)],
-    }
 
 
 def _row(question: Question, before: Figure | None, now: Figure | None) -> dict[str, Any]:

@@ -63,17 +63,13 @@ def trace(table: Table, case: Case, name: str) -> Trace | None:
         return None
     order = np.lexsort((table["step"][mine], table["start"][mine]))
     cuts = np.flatnonzero(np.diff(table["start"][mine][order])) + 1
-    flow, temperature = (
-        _equally_long(np.split(table[column][mine][order], cuts))
-        for column in ("flow_percent", "temperature_degC")
-    )
+    runs = {
+        column: np.split(table[column][mine][order], cuts) for column in ("flow_percent", "temperature_degC")
+    }
+    flow, temperature = (np.stack([run[: min(map(len, each))] for run in each]) for each in runs.values())
     inside = np.abs(flow - BEST_FLOW) <= FLOW_BAND + ROUNDING
     inside &= np.abs(temperature - BEST_TEMPERATURE) <= TEMPERATURE_BAND + ROUNDING
     return Trace(flow, inside)
-
-
-def _equally_long(runs: Sequence[np.ndarray]) -> np.ndarray:
-    return np.stack([run[: min(map(len, runs))] for run in runs])
 
 
 def clog(table: Table, case: Case) -> Clog | None:

@@ -94,7 +94,8 @@ def render(sources: Sources) -> str:
         no_board=gap_of(scores),
         heads=heads(judged_scores),
         answers=answers(sources, judged_scores) if judged_scores else [],
-        better=_better(judged_scores) if judged_scores else 0,
+        # cases that the first screen has no room for: those in which the default fares best
+        better=max(len(_counting(judged_scores)) - MOST, 0) if judged_scores else 0,
         deciding=setpoint_deciding.picture(sources, scores),
         boards=boards(sources, judged_scores) if judged_scores else [],
         worsts=worsts(judged_scores) if judged_scores else [],
@@ -190,7 +191,7 @@ def answers(sources: Sources, scores: Board) -> list[dict[str, Any]]:
                     for name, cell, css in zip(pair, cells, ("dd", "mb"), strict=True)
                 ],
                 "strip": charts.strip(lost, shown),
-                "stay": _stay(own),
+                "stay": share_text(own.stay) if own else "not measured",
                 "stay_bad": states[1] == FAILED,
                 "change": setpoint_card.change(sources, case, own),
                 "decides": case == lowest,
@@ -207,11 +208,6 @@ def _counting(scores: Board) -> list[Case]:
         for case in scores.cases
         if any((cell := scores.cells.get((name, case))) and cell.counts for name in pair)
     ]
-
-
-def _better(scores: Board) -> int:
-    """Cases that the first screen has no room for: those in which the default fares best."""
-    return max(len(_counting(scores)) - MOST, 0)
 
 
 def _share_of(cell: Cell | None) -> float:
@@ -237,10 +233,6 @@ def _reading(name: str, cell: Cell | None, lost: Question, css: str) -> dict[str
         "band": interval,
         "bad": state(lost, _lost(cell)) == FAILED,
     }
-
-
-def _stay(cell: Cell | None) -> str:
-    return "not measured" if cell is None else share_text(cell.stay)
 
 
 # ---- the scoreboard

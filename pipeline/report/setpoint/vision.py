@@ -378,7 +378,7 @@ def _foreign(metrics: Any) -> list[dict[str, str]]:
     return [
         {
             "kind": str(kind),
-            "auroc": _area(figures["auroc"]),
+            "auroc": "not measured" if figures["auroc"] is None else number(float(figures["auroc"]), 3),
             "detected": _share(figures.get("found")),
             "alarms": _share(figures.get("false_alarms", detection.get("false_alarms"))),
         }
@@ -389,10 +389,6 @@ def _foreign(metrics: Any) -> list[dict[str, str]]:
 
 def _share(value: float | None) -> str:
     return "not measured" if value is None else percent(100 * value, 2)
-
-
-def _area(value: float | None) -> str:
-    return "not measured" if value is None else number(float(value), 3)
 
 
 @instead(lambda gap: [("Frames", gap.sentence())])

@@ -440,7 +440,8 @@ NO_FLAGS: Table = dict.fromkeys(("signal", "start_s", "end_s", "kind"), np.empty
 def record(sources: Sources) -> Picture:
     """Every signal of the record, what is masked and what was found strange."""
     table, quality = need(sources.tables["record"]), known(sources.tables["quality"], NO_FLAGS)
-    machine, time = sources.declared.machine, _elapsed(table, sources.declared.machine.sample_time_s)
+    machine, time = sources.declared.machine, np.arange(len(table["time_s"]))
+    time = machine.sample_time_s * time
     set_points = known(sources.tables["set_points"], {})
     masked_total = 0
     halves: list[list[Markup]] = [[], []]
@@ -487,10 +488,6 @@ def _quarantined(metrics: Any) -> str:
         else f"{count(quarantined, 'recording is', 'recordings are').capitalize()} quarantined: see the "
         "findings."
     )
-
-
-def _elapsed(table: Table, step: float) -> np.ndarray:
-    return step * np.arange(len(table["time_s"]))
 
 
 def _signal(
