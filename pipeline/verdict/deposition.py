@@ -404,8 +404,11 @@ def _near(case: Parts, composer: str) -> Reading:
     if gap_of(figure):
         return figure, words
     part = max((part for part in bounded if ratio(part) is not None), key=lambda part: ratio(part) or 0.0)
-    least = percent(case.bound[part.part, part.material], 2)
-    return figure, {**words, "value": percent(part.scores[composer].error, 2), "least": least}
+    return figure, {
+        **words,
+        "value": percent(part.scores[composer].error, 2),
+        "least": percent(case.bound[part.part, part.material], 2),
+    }
 
 
 def _above(case: Parts, composer: str) -> Reading:
@@ -419,8 +422,11 @@ def _above(case: Parts, composer: str) -> Reading:
     if pair is None:
         return _open()
     points, part = pair
-    text = f"{'+' if points > 0 else '−'}{number(abs(points), 1)} points"
-    return count_of(points), {"text": text, "value": number(points, 1), "where": where(part)}
+    return count_of(points), {
+        "text": f"{'+' if points > 0 else '−'}{number(abs(points), 1)} points",
+        "value": number(points, 1),
+        "where": where(part),
+    }
 
 
 def _forecast(case: Parts, composer: str) -> Reading:

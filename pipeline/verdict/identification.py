@@ -106,8 +106,9 @@ def _rule(evidence: Evidence, key: str) -> Rule:
         undecided = rule.state == UNDECIDED and row.unit == "%"
         return rule._replace(remedy=_longer(rule.question, rule.figure)) if undecided else rule
     gap = rule.figure
-    remedy = gap.remedy and gap.remedy.rstrip(".") + "."
-    return rule._replace(reason=gap.reason.rstrip(".") + ".", remedy=remedy)
+    return rule._replace(
+        reason=gap.reason.rstrip(".") + ".", remedy=gap.remedy and gap.remedy.rstrip(".") + "."
+    )
 
 
 def _decision(uses: Mapping[str, str]) -> str:
@@ -312,8 +313,11 @@ def _stability(evidence: Evidence, question: Question) -> Reading:
     radius = need_figure(evidence.figures["identify_plant"], "largest_pole")
     pole = number(radius, 4 if abs(radius - 1) > 1e-4 else 6)
     refinement = evidence.params.get("identify_plant", {}).get("refinement")
-    case = "validated" if refinement == "validated" else "other"
-    return count_of(radius), {"pole": pole, "text": f"largest pole {pole}", "case": case}
+    return count_of(radius), {
+        "pole": pole,
+        "text": f"largest pole {pole}",
+        "case": "validated" if refinement == "validated" else "other",
+    }
 
 
 def _gains(evidence: Evidence, question: Question) -> Reading:

@@ -189,11 +189,15 @@ def judge(
         )
     case, text = words.get("case", ""), words.get("text", _text(figure.value, row.unit))
     rule = Rule(row.name, question, figure, text, allowed, row.place)
-    undecided = decides(question, figure, words) if decides and rule.state == UNDECIDED else ""
     fails = words.get("fails") or (row.fails if isinstance(row.fails, str) else row.fails[case])
     remedy = words.get("remedy") or (row.remedy if isinstance(row.remedy, str) else row.remedy[case])
-    limit = words.get("limit_words") or _text(question.limit, row.unit)
-    places = {"name": row.name, "value": text, **words, "limit": limit, "undecided": undecided}
+    places = {
+        "name": row.name,
+        "value": text,
+        **words,
+        "limit": words.get("limit_words") or _text(question.limit, row.unit),
+        "undecided": decides(question, figure, words) if decides and rule.state == UNDECIDED else "",
+    }
     sentence = row.passes if row.passes and rule.state == PASSED else fails
     try:
         return rule._replace(reason=sentence.format(**places), remedy=remedy.format(**places))

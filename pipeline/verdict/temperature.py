@@ -217,7 +217,7 @@ def _of(stage: Any, samples: Any, needed: Any) -> Figure | Missing:
     if samples is None or not needed:
         return Missing(OPEN, "the number of samples that are needed is not known")
     ratio, more = samples / needed, max(needed - samples, 0)
-    note = f"{number(samples, 0)} of {number(needed, 0)} samples" + (
-        f"; record {number(more, 0)} more" if more else ""
+    return count_of(ratio)._replace(
+        note=f"{number(samples, 0)} of {number(needed, 0)} samples"
+        + (f"; record {number(more, 0)} more" if more else "")
     )
-    return count_of(ratio)._replace(note=note)

@@ -280,8 +280,9 @@ def _text(value: Any) -> Any:
 
 
 def _decode(fields: Mapping[str, Any]) -> Verdict:
-    rules = tuple(tuple(_rule(rule) for rule in line) for line in fields["rules"])
-    return Verdict(**{name: fields[name] for name in Verdict._fields})._replace(rules=rules)
+    return Verdict(**{name: fields[name] for name in Verdict._fields})._replace(
+        rules=tuple(tuple(_rule(rule) for rule in line) for line in fields["rules"])
+    )
 
 
 def _rule(fields: Mapping[str, Any]) -> Rule:

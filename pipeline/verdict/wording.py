@@ -76,8 +76,7 @@ def words_of(question: Question, figure: Figure, name: str) -> dict[str, Any]:
     if question.key == "data" or not (math.isinf(figure.value) or value == OFF_THE_SCALE):
         return words
     key = f" in {question.key.replace('_', ' ')}" if value == OFF_THE_SCALE else ""
-    lost = value if value == INFINITE["settling"] else f"is {value}{key}"
-    return words | {"fails": LOST, "lost": lost}
+    return words | {"fails": LOST, "lost": value if value == INFINITE["settling"] else f"is {value}{key}"}
 
 
 def straddling(question: Question, figure: Figure, words: Mapping[str, Any]) -> str:

@@ -82,12 +82,11 @@ def rule_rows(shown: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The rules in the order in which they were asked."""
     rows = []
     for rule in shown["rules"]:
-        state = OPEN if not rule.get("asked", True) else PASSED if rule["passed"] else FAILED
         found, limit = (_figure(rule.get(key), rule.get("unit") or "") for key in ("found", "limit"))
         rows.append(
             {
                 "name": rule["name"].replace("_", " "),
-                "state": state,
+                "state": OPEN if not rule.get("asked", True) else PASSED if rule["passed"] else FAILED,
                 "found": found,
                 "limit": f"{_side(rule)}{limit}",
                 "sentence": rule["sentence"],
@@ -182,8 +181,9 @@ def _circle(loops: Sequence[Mapping[str, Any]], *, near: bool, largest: float):
             layers.append(
                 charts.crosses(frame, real, imag) if model else charts.dots(frame, real, imag, "try", 1.7)
             )
-    alt = f"{len(loops)} closed loops, the largest pole of size {number(largest, 4)}"
-    return charts.panel(frame, layers, alt=alt)
+    return charts.panel(
+        frame, layers, alt=f"{len(loops)} closed loops, the largest pole of size {number(largest, 4)}"
+    )
 
 
 def margins(shown: Mapping[str, Any]) -> list[tuple[str, ...]]:

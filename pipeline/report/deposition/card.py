@@ -118,12 +118,15 @@ def _row(
     each = {name: [value for part in parts if (value := read(part, name)) is not None] for name in names}
     most = [max(values) if values else None for values in each.values()]
     best = best_of(most, at_least=False)
-    cells = [
-        _cell(values, unit, best=max(values, default=None) == best is not None, limit=limit)
-        for values in each.values()
-    ]
     limit_text = f"{sign}{'' if sign == '±' else ' '}{limit:g}{THIN}{unit}"
-    return {"title": title, "limit": limit_text, "cells": cells}
+    return {
+        "title": title,
+        "limit": limit_text,
+        "cells": [
+            _cell(values, unit, best=max(values, default=None) == best is not None, limit=limit)
+            for values in each.values()
+        ],
+    }
 
 
 def _cell(values: Sequence[float], unit: str, *, best: bool, limit: float) -> dict[str, Any]:

@@ -369,12 +369,14 @@ def _panel(table: Table, rows: np.ndarray, task: str, material: str, Ts: float, 
             dy=8,
         )
     )
-    alt = (
-        f"{task} of material {material}: begins {number(lead, 2)} s ahead of its event "
-        f"and peaks at {short(most, 2)} times the steady command"
-    )
     return charts.panel(
-        frame, layers, alt=alt, css="mb wide", title="× steady" if titled else "", units=("s", "×")
+        frame,
+        layers,
+        alt=f"{task} of material {material}: begins {number(lead, 2)} s ahead of its event "
+        f"and peaks at {short(most, 2)} times the steady command",
+        css="mb wide",
+        title="× steady" if titled else "",
+        units=("s", "×"),
     )
 
 
@@ -423,23 +425,27 @@ def chains(sources: Sources) -> dict[str, Any]:
             if extruder:
                 heads.append({"material": name, "word": word})
                 values.append(extruder)
-    rows = [
-        {
-            "title": title,
-            "cells": [
-                "none" if extruder.get(key) is None else short(float(extruder[key]), 3) for extruder in values
-            ],
-        }
-        for key, title in CHAIN
-        if any(extruder.get(key) for extruder in values)
-    ]
     fits = [
         f"{material['material']}: on trials that it was not fitted to the chain misses "
         f"{percent(material['chain']['held_out_percent'], 2)} of the flow’s movement"
         for material in learned[:MATERIALS]
         if material["chain"].get("held_out_percent") is not None
     ]
-    return {"rows": rows, "heads": heads, "fit": "; ".join(fits)}
+    return {
+        "rows": [
+            {
+                "title": title,
+                "cells": [
+                    "none" if extruder.get(key) is None else short(float(extruder[key]), 3)
+                    for extruder in values
+                ],
+            }
+            for key, title in CHAIN
+            if any(extruder.get(key) for extruder in values)
+        ],
+        "heads": heads,
+        "fit": "; ".join(fits),
+    }
 
 
 @or_empty
@@ -470,8 +476,10 @@ def columns(sources: Sources) -> dict[str, Any]:
     table = need(sources.tables["library"])
     library = pd.DataFrame(table)
     Ts = float(known(lookup(sources.tables["learned"], "sample_time_s"), math.nan))
-    rows = [_signal(row, Ts) for row in library.head(MOST).itertuples()]
-    return {"rows": rows, "more": max(len(library) - MOST, 0)}
+    return {
+        "rows": [_signal(row, Ts) for row in library.head(MOST).itertuples()],
+        "more": max(len(library) - MOST, 0),
+    }
 
 
 def _signal(row: Any, Ts: float) -> dict[str, Any]:

@@ -400,29 +400,29 @@ def lines(sources: Sources) -> dict[str, Any]:
     allowed = sources.declared.rules.line_volume_percent
     printed = pd.DataFrame(table).fillna({"error_percent": 0.0})
     printed["off_percent"] = printed.error_percent.abs()
-    rows = [
-        {
-            "part": row.part,
-            "line": row.line,
-            "tool": f"T{row.tool}",
-            "duration": number(row.duration_s, 2),
-            "planned": number(row.planned_mm3, 3),
-            "predicted": number(row.predicted_mm3, 3),
-            "on_off": _signed(100 * (row.on_off_mm3 / max(row.planned_mm3, 1e-12) - 1)),
-            "error": _signed(row.error_percent),
-            "bad": row.off_percent > allowed,
-            "short": row.shorter_than_lead,
-        }
-        for row in printed.nlargest(WORST, "off_percent").itertuples()
-    ]
     beyond, short_runs = int((printed.off_percent > allowed).sum()), int(printed.shorter_than_lead.sum())
-    summary = (
-        f"Of {count(len(printed), 'line')}, {'none is' if not beyond else count(beyond, 'is', 'are')} "
+    return {
+        "rows": [
+            {
+                "part": row.part,
+                "line": row.line,
+                "tool": f"T{row.tool}",
+                "duration": number(row.duration_s, 2),
+                "planned": number(row.planned_mm3, 3),
+                "predicted": number(row.predicted_mm3, 3),
+                "on_off": _signed(100 * (row.on_off_mm3 / max(row.planned_mm3, 1e-12) - 1)),
+                "error": _signed(row.error_percent),
+                "bad": row.off_percent > allowed,
+                "short": row.shorter_than_lead,
+            }
+            for row in printed.nlargest(WORST, "off_percent").itertuples()
+        ],
+        "summary": f"Of {count(len(printed), 'line')}, "
+        f"{'none is' if not beyond else count(beyond, 'is', 'are')} "
         f"predicted more than {allowed:g}{THIN}% off {'its' if beyond <= 1 else 'their'} volume; "
         f"{count(short_runs, 'belongs', 'belong') if short_runs else 'none belongs'} to runs shorter than "
-        "the lead of Stop."
-    )
-    return {"rows": rows, "summary": summary}
+        "the lead of Stop.",
+    }
 
 
 def _signed(value: float) -> str:
@@ -440,12 +440,13 @@ def forecasts(sources: Sources) -> dict[str, Any]:
     unknown, parts = unknown_streams(sources.evidence), known(structures(sources.evidence), [])
     # the verdict gives the reason of the first; here it would stand again
     said = next((part.why for part in parts if part.unknown()), "")
-    rows = [
-        _forecast(part, material, report, (part, material) in unknown, said)
-        for part, report in conformance.items()
-        for material in report.get("saturation", {})
-    ]
-    return {"rows": rows}
+    return {
+        "rows": [
+            _forecast(part, material, report, (part, material) in unknown, said)
+            for part, report in conformance.items()
+            for material in report.get("saturation", {})
+        ]
+    }
 
 
 def _forecast(part: str, material: str, report: dict[str, Any], unknown: bool, said: str) -> dict[str, Any]:
@@ -519,11 +520,11 @@ def extruded(sources: Sources) -> dict[str, Any]:
             "summary": "No line’s volume is E’s: each is its length times the declared bead’s area.",
         }
     times = " to ".join(dict.fromkeys(short(share, 3) for share in (min(shares), max(shares))))
-    summary = (
-        f"E gives the volumes of {len(shares)} of {count(len(rows), 'tool')}; it asks for {times} times the "
-        "declared bead’s."
-    )
-    return {"rows": rows, "summary": summary}
+    return {
+        "rows": rows,
+        "summary": f"E gives the volumes of {len(shares)} of {count(len(rows), 'tool')}; it asks for "
+        f"{times} times the declared bead’s.",
+    }
 
 
 def _tool(part: str, tool: str, source: str, one: dict[str, Any] | None) -> dict[str, str]:

@@ -60,20 +60,26 @@ def loop_state(sources: Sources) -> dict[str, Any]:
             f"{listed(answering)} {'answers' if len(answering) == 1 else 'answer'} past errors of the "
             f"outputs ({_p(largest)}), as a controller does."
         )
-        head = "Recorded in closed loop."
-        return {"closed": True, "head": head, "test": test, "follows": _closed_follows(sources)}
+        return {
+            "closed": True,
+            "head": "Recorded in closed loop.",
+            "test": test,
+            "follows": _closed_follows(sources),
+        }
     nearest = min(p_values, key=p_values.get)
     threshold = f"; feedback is called below {short(level, 2)}" if level else ""
     test = (
         f"No input is seen to answer past errors of the outputs: least {_p(p_values[nearest])}, "
         f"{nearest}{threshold}."
     )
-    follows = (
-        "The model is identified as from an open loop. A weak proportional controller whose set-point never "
-        "moves stays below this test: where the machine had one, believe the fit some steps ahead before the "
-        "simulation."
-    )
-    return {"closed": False, "head": "No feedback was recognised.", "test": test, "follows": follows}
+    return {
+        "closed": False,
+        "head": "No feedback was recognised.",
+        "test": test,
+        "follows": "The model is identified as from an open loop. A weak proportional controller whose "
+        "set-point never moves stays below this test: where the machine had one, believe the fit some steps ahead before the "
+        "simulation.",
+    }
 
 
 def _closed_follows(sources: Sources) -> str:
@@ -228,14 +234,13 @@ def _pairs(sources: Sources) -> dict[str, Any]:
     # the longest time after a step that the step responses show
     horizon = known(sources.tables["steps"], {"time_s": np.array([np.inf])})["time_s"].max()
     gaps = _gaps(table, float(horizon))
-    outputs = [_output_pairs(table, gaps, output.name) for output in sources.declared.machine.outputs]
     fitted = sum(not gap for gap in gaps)
     every = f"of {count(len(gaps), 'pair')}"
-    finding = (
-        f"{count(fitted, every, every).capitalize()} {'has' if fitted == 1 else 'have'} a gain of known sign "
-        "and a time constant that the record shows. Bold: the input that moves an output furthest."
-    )
-    return {"finding": finding, "outputs": outputs}
+    return {
+        "finding": f"{count(fitted, every, every).capitalize()} {'has' if fitted == 1 else 'have'} a gain of "
+        "known sign and a time constant that the record shows. Bold: the input that moves an output furthest.",
+        "outputs": [_output_pairs(table, gaps, output.name) for output in sources.declared.machine.outputs],
+    }
 
 
 def _output_pairs(table: Table, gaps: list[str], output: str) -> dict[str, Any]:

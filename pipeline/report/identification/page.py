@@ -305,17 +305,21 @@ def next_experiment(sources: Sources) -> dict[str, Any]:
     if not told["written"]:
         why = f"No experiment is written: {_celsius(told['reason'])}."
         return {"sentences": [why, _around(added)], "rows": []}
-    rows = [
-        {
-            "output": output.name,
-            "target": _degrees(told["target_degC"].get(output.name)),
-            "forecast": _range(told["lowest_degC"].get(output.name), told["highest_degC"].get(output.name)),
-            "limits": _range(*(told["limit_degC"][output.name][end] for end in ("low", "high"))),
-        }
-        for output in sources.declared.machine.outputs
-        if output.name in told["limit_degC"]
-    ]
-    return {"sentences": [_played(told), _taught(told), _around(added)], "rows": rows}
+    return {
+        "sentences": [_played(told), _taught(told), _around(added)],
+        "rows": [
+            {
+                "output": output.name,
+                "target": _degrees(told["target_degC"].get(output.name)),
+                "forecast": _range(
+                    told["lowest_degC"].get(output.name), told["highest_degC"].get(output.name)
+                ),
+                "limits": _range(*(told["limit_degC"][output.name][end] for end in ("low", "high"))),
+            }
+            for output in sources.declared.machine.outputs
+            if output.name in told["limit_degC"]
+        ],
+    }
 
 
 def _played(told: Mapping[str, Any]) -> str:

@@ -110,9 +110,6 @@ def _stretch(sources: Sources, table: Table, name: str, small: str, points: int)
             for v, css in lines
         ]
 
-    alt = (
-        f"{name} on the hold-out: fit {small}; {count(int((~np.isfinite(measured)).sum()), 'sample')} masked"
-    )
     size, late = (
         float(np.sqrt(np.nanmean(part**2))) if np.isfinite(part).any() else np.nan for part in error
     )
@@ -123,7 +120,8 @@ def _stretch(sources: Sources, table: Table, name: str, small: str, points: int)
         charts.panel(
             above,
             drawn(above, [(measured, "line seen"), (simulated, "line thin")]),
-            alt=alt,
+            alt=f"{name} on the hold-out: fit {small}; "
+            f"{count(int((~np.isfinite(measured)).sum()), 'sample')} masked",
             css="mb wide",
             title="°C",
             x_ticks=False,
@@ -215,14 +213,16 @@ def cross(sources: Sources) -> dict[str, Any]:
         if failed
         else "No: what the inputs do, the model explains."
     )
-    caption = (
-        f"Correlation of the one-step errors with the input, lag in samples; {closed}"
+    return {
+        "finding": text,
+        "rows": rows,
+        "caption": f"Correlation of the one-step errors with the input, lag in samples; {closed}"
         f"right of zero the input came first. Grey: the 99{THIN}% band of a single lag; "
         "the test widens it for the number of lags. Left of zero, pale: feedback from errors to inputs, "
-        f"no fault of the model.{more}"
-    )
-    origin = page.origin(sources.source("residuals"))
-    return {"finding": text, "rows": rows, "caption": caption, "origin": origin, "across": size.across}
+        f"no fault of the model.{more}",
+        "origin": page.origin(sources.source("residuals")),
+        "across": size.across,
+    }
 
 
 def _correlations(table: Table, rows: np.ndarray) -> charts.Axis:
@@ -253,12 +253,15 @@ def _stems(table: Table, rows: np.ndarray, y: charts.Axis, size: Room, name: str
         for part, css in ((judged & ~marked, "stem"), (judged & marked, "stem bad"), (~judged, "stem pale"))
     ]
     worst = int(np.abs(np.nan_to_num(np.where(judged, value, 0.0))).argmax())
-    alt = (
-        f"{name}: {int((outside & judged).sum())} of {int(judged.sum())} lags outside of "
+    return charts.panel(
+        frame,
+        layers,
+        alt=f"{name}: {int((outside & judged).sum())} of {int(judged.sum())} lags outside of "
         f"±{number(limit, 2)}, most {number(float(np.nan_to_num(value[worst])), 2)} at lag "
-        f"{int(lag[worst])}"
+        f"{int(lag[worst])}",
+        css=size.css,
+        units=("samples", ""),
     )
-    return charts.panel(frame, layers, alt=alt, css=size.css, units=("samples", ""))
 
 
 def matrix(
@@ -313,15 +316,17 @@ def steps(sources: Sources) -> dict[str, Any]:
         + "The figure is the largest excursion, with its band; for an effect that turns back or still rises "
         "at the end, also its steady value."
     )
-    caption = (
-        f"Answer in °C to one per cent of the input, over {short(end)}{THIN}s from rest; "
+    return {
+        "finding": text,
+        "rows": rows,
+        "caption": f"Answer in °C to one per cent of the input, over {short(end)}{THIN}s from rest; "
         f"the panels of an output share one scale. Band: 90{THIN}% of {plants}, "
         "wider where fits without one quarter of the record differ more, "
         f"cut where it leaves the panel. τ: 1.5 times the way from 28.3 to 63.2{THIN}% of the largest "
-        f"excursion; delay: what is left of the time to 63.2{THIN}%.{more}"
-    )
-    origin = page.origin(sources.source("steps", "dynamics"), y="response")
-    return {"finding": text, "rows": rows, "caption": caption, "origin": origin, "across": size.across}
+        f"excursion; delay: what is left of the time to 63.2{THIN}%.{more}",
+        "origin": page.origin(sources.source("steps", "dynamics"), y="response"),
+        "across": size.across,
+    }
 
 
 def _members(sources: Sources) -> str:
@@ -463,11 +468,21 @@ def poles(sources: Sources) -> Picture:
             for part, css in ((extra, "try pale"), (of_mine, "try"))
         ]
         layers.append(charts.crosses(frame, real[mine], imag[mine]))
-        alt = (
-            f"{head}: {int(mine.sum())} poles, the largest of size {number(slowest, 4)}, "
-            f"{'inside' if slowest < 1 else 'on or outside'} the unit circle"
+        shown.append(
+            PictureColumn(
+                head,
+                small,
+                "",
+                [
+                    charts.panel(
+                        frame,
+                        layers,
+                        alt=f"{head}: {int(mine.sum())} poles, the largest of size {number(slowest, 4)}, "
+                        f"{'inside' if slowest < 1 else 'on or outside'} the unit circle",
+                    )
+                ],
+            )
         )
-        shown.append(PictureColumn(head, small, "", [charts.panel(frame, layers, alt=alt)]))
     plants = int(table["member"].max())
     text = (
         f"{count(int(mine.sum()), 'pole').capitalize()}, the largest of size {number(slowest, 4)}: "
@@ -576,10 +591,6 @@ def excitation(sources: Sources) -> Picture:
         )
         own: Mapping = excited["inputs"].get(signal.name, {})
         small = f"{short(own['level'], 2)}{THIN}%, rank {own['rank']} of {excited['lags']}" if own else ""
-        alt = (
-            f"{signal.name}: {small}; level {short(float(level.min()), 2)} to "
-            f"{short(float(level.max()), 2)} % in {len(level)} bands"
-        )
         shown.append(
             PictureColumn(
                 signal.name,
@@ -589,7 +600,8 @@ def excitation(sources: Sources) -> Picture:
                     charts.panel(
                         frame,
                         [charts.line(frame, edges, np.append(level, level[-1]), steps=True)],
-                        alt=alt,
+                        alt=f"{signal.name}: {small}; level {short(float(level.min()), 2)} to "
+                        f"{short(float(level.max()), 2)} % in {len(level)} bands",
                         css=size.css,
                     )
                 ],
@@ -638,9 +650,20 @@ def singular(table: Table) -> PictureColumn:
         layers.append(charts.level(frame, edge, "lim", "noise alone"))
     last_value = values[order == last]
     size = short(float(last_value[0])) if len(last_value) else "none"
-    alt = f"Order {last} is chosen: its singular value {size}, noise alone reaches {short(edge)}"
     small = "of the identification, by order; log"
-    return PictureColumn("Singular values", small, "", [charts.panel(frame, layers, alt=alt, css="mb")])
+    return PictureColumn(
+        "Singular values",
+        small,
+        "",
+        [
+            charts.panel(
+                frame,
+                layers,
+                alt=f"Order {last} is chosen: its singular value {size}, noise alone reaches {short(edge)}",
+                css="mb",
+            )
+        ],
+    )
 
 
 def left_out(table: Table) -> PictureColumn:
@@ -665,5 +688,9 @@ def left_out(table: Table) -> PictureColumn:
             ),
         ]
         outcome = f"order {at:g} leaves {percent(100 * least, 2)} of the variation unexplained"
-    alt = f"Error on left-out blocks by order: {outcome}"
-    return PictureColumn(head, small, "", [charts.panel(frame, layers, alt=alt, css="mb")])
+    return PictureColumn(
+        head,
+        small,
+        "",
+        [charts.panel(frame, layers, alt=f"Error on left-out blocks by order: {outcome}", css="mb")],
+    )

@@ -118,14 +118,13 @@ def _setpoints(run: Mapping[str, Any]) -> list[Markup]:
 def _way(run: Mapping[str, Any]) -> Markup:
     rings = [PaperCurve(*_ellipse(20.0, 10.0, scale), "ref") for scale in (1.0, 3.0)]
     frame_title = "temperature in °C, against flow in %"
-    way = PaperCurve(run["flow"], run["temperature"], "line")
     return plane(
         rings,
         title=frame_title,
         alt=f"The way ends at {number(run['flow'][-1], 0)} % and {number(run['temperature'][-1], 0)} °C",
         across=FLOW,
         up=TEMPERATURE,
-        way=way,
+        way=PaperCurve(run["flow"], run["temperature"], "line"),
     )
 
 

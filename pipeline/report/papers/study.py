@@ -74,11 +74,16 @@ def _published(study: Any) -> dict[str, Any]:
     rows = []
     for key, (title, convention) in CONVENTIONS.items():
         if key in printed and key in reproduced:
-            cells = [
-                _reproduced(printed[key][name], reproduced[key][name], places)
-                for name, places in (("J100", 1), ("J1000", 1), ("error", 4))
-            ]
-            rows.append({"title": title, "convention": convention, "cells": cells})
+            rows.append(
+                {
+                    "title": title,
+                    "convention": convention,
+                    "cells": [
+                        _reproduced(printed[key][name], reproduced[key][name], places)
+                        for name, places in (("J100", 1), ("J1000", 1), ("error", 4))
+                    ],
+                }
+            )
     return {"rows": rows}
 
 
@@ -452,9 +457,21 @@ def progress(rows: Table, head: str, small: str, level: Any, *, excess: bool) ->
             dy=-6,
         )
     )
-    alt = f"{head}: after {count(len(at), 'evaluation')} " + (
-        f"the best is {percent(end, 2)} above the optimum"
-        if excess
-        else f"the best costs {short(end)}, the default weights {short(level)}"
+    return PictureColumn(
+        head,
+        small,
+        "",
+        [
+            charts.panel(
+                frame,
+                layers,
+                alt=f"{head}: after {count(len(at), 'evaluation')} "
+                + (
+                    f"the best is {percent(end, 2)} above the optimum"
+                    if excess
+                    else f"the best costs {short(end)}, the default weights {short(level)}"
+                ),
+                css="mb",
+            )
+        ],
     )
-    return PictureColumn(head, small, "", [charts.panel(frame, layers, alt=alt, css="mb")])

@@ -90,8 +90,9 @@ def headline(metrics: Metrics) -> dict[str, Any]:
         state, subject = WORDS.get(str(verdict.get("state")), "undecided"), verdict.get("subject")
         values[loop] = f"{state}: {subject}" if subject else state
         values |= {name: _ends(figures[loop][key])[0] for key, name in names.items() if key in figures[loop]}
-    bands = {loop: {key: _ends(found) for key, found in figures[loop].items()} for loop in LOOPS}
-    return values | {"bands": bands}
+    return values | {
+        "bands": {loop: {key: _ends(found) for key, found in figures[loop].items()} for loop in LOOPS}
+    }
 
 
 def _ends(figure: Figure) -> list[float | None]:

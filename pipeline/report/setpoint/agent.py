@@ -152,11 +152,10 @@ def _surface(
         charts.dots(frame, q[-1:], u[-1:], "dot whole" if ok else "dot off", 2.8)
         for q, u, ok in zip(flow, temperature, last, strict=True)
     ]
-    alt = f"{name}: of {len(flow)} starts {ends} end inside 90–110 % and 205–215 °C and stay there"
     return charts.panel(
         frame,
         layers,
-        alt=alt,
+        alt=f"{name}: of {len(flow)} starts {ends} end inside 90–110 % and 205–215 °C and stay there",
         css=f"{css} surface",
         title="°C against % of flow" if titled else "",
         units=("%", "°C"),
@@ -200,11 +199,14 @@ def _steps(name: str, flow: list[np.ndarray], inside: list[np.ndarray], css: str
     layers += [charts.line(frame, np.arange(len(q)), q, "line way") for q in flow]
     layers.append(charts.label(frame, last, 320, text, anchor="end", dy=8))
     lowest, highest = (end(float(end(q[len(q) // 2 :])) for q in flow) for end in (min, max))
-    alt = (
-        f"{name}: {text}; in the second half flows lie between {number(lowest, 0)} and {number(highest, 0)} %"
-    )
     return charts.panel(
-        frame, layers, alt=alt, css=css, title="% of flow" if titled else "", units=("decisions", "%")
+        frame,
+        layers,
+        alt=f"{name}: {text}; in the second half flows lie between {number(lowest, 0)} and "
+        f"{number(highest, 0)} %",
+        css=css,
+        title="% of flow" if titled else "",
+        units=("decisions", "%"),
     )
 
 
@@ -245,12 +247,14 @@ def _course(mine: pd.DataFrame, reward_text: str) -> Markup:
             )
         layers.append(charts.label(frame, begin, y.low, f"phase {k}", dx=3, dy=-4))
         layers.append(charts.line(frame, updates.to_numpy()[here], reward.to_numpy()[here]))
-    alt = (
-        f"The paper’s agent: mean reward at the end of each phase {reward_text}, "
-        f"after {number(float(mine['update'].max()), 0)} updates in all"
-    )
     return charts.panel(
-        frame, layers, alt=alt, css="dd wide", title="mean reward", units=("thousand updates", "")
+        frame,
+        layers,
+        alt=f"The paper’s agent: mean reward at the end of each phase {reward_text}, "
+        f"after {number(float(mine['update'].max()), 0)} updates in all",
+        css="dd wide",
+        title="mean reward",
+        units=("thousand updates", ""),
     )
 
 
@@ -373,7 +377,6 @@ def harms(sources: Sources, board: Board | Missing) -> dict[str, Any]:
         remedy = "Run ./run dvc repro evaluate_setpoint"
         raise Absent(Missing("not measured", "no run from a good start", remedy))
     seconds = decision_seconds(sources)
-    rows = [_row(board, name, harm, seconds) for name, harm in known.items()]
     clog = case_text(CLOG, whole=True)
     caption = (
         f"Across: runs from good starts that leave ±{BEYOND[-1]}{THIN}% of flow within 200 decisions, in "
@@ -381,19 +384,22 @@ def harms(sources: Sources, board: Board | Missing) -> dict[str, Any]:
         f"that are inside again 60 decisions after a clog ({clog}). Crosses: 95{THIN}% intervals of those "
         "that may run. Grey: harm that is allowed in some case."
     )
-    picture = Picture(
-        _finding(board, known, limits),
-        [
-            PictureColumn(
-                "Runs recovered from a clog", "in per cent, against harm", "", [_chart(board, known)]
-            )
-        ],
-        caption,
-        page.origin(sources.source("scoreboard", "choice")),
-        "harm",
-        HARM_TITLE,
-    )
-    return {"picture": picture, "rows": rows, "clustered": clustered(board)}
+    return {
+        "picture": Picture(
+            _finding(board, known, limits),
+            [
+                PictureColumn(
+                    "Runs recovered from a clog", "in per cent, against harm", "", [_chart(board, known)]
+                )
+            ],
+            caption,
+            page.origin(sources.source("scoreboard", "choice")),
+            "harm",
+            HARM_TITLE,
+        ),
+        "rows": [_row(board, name, harm, seconds) for name, harm in known.items()],
+        "clustered": clustered(board),
+    }
 
 
 def clustered(board: Board) -> str:
@@ -515,16 +521,13 @@ def _chart(board: Board, known: dict[str, Harm]) -> Markup:
         layers.append(charts.dots(frame, harm.figure.value, share.value, f"dot whole {mark}", 4.0))
         layers.append(_name(frame, name, a, b, taken))
     mine = known.get(board.default)
-    alt = (
-        "Harm against recovery"
-        if mine is None
-        else f"{board.default} takes {_taken(mine)} and recovers "
-        f"{share_text(_recovered(board, board.default))} of clogs"
-    )
     return charts.panel(
         frame,
         layers,
-        alt=alt,
+        alt="Harm against recovery"
+        if mine is None
+        else f"{board.default} takes {_taken(mine)} and recovers "
+        f"{share_text(_recovered(board, board.default))} of clogs",
         css="mb wide big",
         title="% of clogs recovered, against % harmed",
         units=("%", "%"),

@@ -113,8 +113,11 @@ def _cost(sources: Sources) -> str:
 def _shares(title: str, scores: Board, names: Sequence[str], what: str, limit: float) -> dict[str, Any]:
     figures = [worst(scores, name, what)[0] for name in names]
     best = best_of([f.value if isinstance(f, Figure) else None for f in figures], at_least=True)
-    cells = [_share(f, best, bad=isinstance(f, Figure) and f.high < limit) for f in figures]
-    return {"title": title, "limit": f"≥ {limit:g}{THIN}%", "cells": cells}
+    return {
+        "title": title,
+        "limit": f"≥ {limit:g}{THIN}%",
+        "cells": [_share(f, best, bad=isinstance(f, Figure) and f.high < limit) for f in figures],
+    }
 
 
 @instead(lambda gap: cell(gap.state))

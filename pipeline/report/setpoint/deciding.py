@@ -212,8 +212,14 @@ def _inside(board: Board, found: Traces, limit: float) -> Markup:
         layers.append(charts.line(frame, *corners(share), styles[name], steps=True))
         ends.append(f"{name} {number(float(share[-1]), 0)} %")
     layers += [*_event(frame, found.clog), *_key(frame, board, found)]
-    alt = f"Runs inside at the end: {', '.join(ends[::-1])}; {limit:g} % are to settle"
-    return charts.panel(frame, layers, alt=alt, css="mb wide", title="inside, %", units=("decisions", "%"))
+    return charts.panel(
+        frame,
+        layers,
+        alt=f"Runs inside at the end: {', '.join(ends[::-1])}; {limit:g} % are to settle",
+        css="mb wide",
+        title="inside, %",
+        units=("decisions", "%"),
+    )
 
 
 def _event(frame: charts.Frame, happens: Clog | None) -> list[Markup]:

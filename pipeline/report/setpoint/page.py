@@ -269,13 +269,12 @@ def boards(sources: Sources, scores: Board) -> list[dict[str, Any]]:
 def _row(scores: Board, name: str, cases: list[Case], limits: dict[str, float]) -> dict[str, Any]:
     """One controller's row in the cases of one simulator."""
     _, lowest = worst(scores, name, "lasting")
-    cells = [_cell(scores.cells.get((name, case)), limits, bold=case == lowest) for case in cases]
     return {
         "name": name,
         "mark": role(scores, name),
         "default": name == scores.default,
         "kind": scores.kinds[name],
-        "cells": cells,
+        "cells": [_cell(scores.cells.get((name, case)), limits, bold=case == lowest) for case in cases],
     }
 
 
@@ -302,8 +301,13 @@ def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> dict[st
     more = f"past it {number(cell.overshoot, 0)}{THIN}%" if cell.overshoot == cell.overshoot else ""
     more += f", off {number(cell.flow_error, 1)}{THIN}%" if cell.flow_error == cell.flow_error else ""
     flow, degrees, share = cell.worst_start
-    tip = f"{cell.runs:,} runs; fewest settle from {flow:g} % and {degrees:g} °C: {number(share, 0)} %"
-    return {"lines": lines, "steps": steps, "more": more.strip(", "), "tip": tip, "bold": bold}
+    return {
+        "lines": lines,
+        "steps": steps,
+        "more": more.strip(", "),
+        "tip": f"{cell.runs:,} runs; fewest settle from {flow:g} % and {degrees:g} °C: {number(share, 0)} %",
+        "bold": bold,
+    }
 
 
 def _worth(cell: Cell, what: str, share: Figure) -> str:

@@ -89,8 +89,14 @@ def _diagram(bins: Table, head: str, of: str, words: str, *, title: str) -> Mark
         for a, b, k in zip(x, y, n, strict=True)
     ]
     layers.append(charts.label(frame, 1.0, 0.04, words, anchor="end"))
-    alt = f"{head}: stated and true share of right answers are {words}, over {int(n.sum())} {of}s"
-    return charts.panel(frame, layers, alt=alt, css="dd", title=title, units=("stated", "right"))
+    return charts.panel(
+        frame,
+        layers,
+        alt=f"{head}: stated and true share of right answers are {words}, over {int(n.sum())} {of}s",
+        css="dd",
+        title=title,
+        units=("stated", "right"),
+    )
 
 
 @as_picture("confusion", "What is taken for what, by temperature")
@@ -229,8 +235,14 @@ def _scaled_shares(frame: charts.Frame, head: str, x: np.ndarray, y: np.ndarray,
     layers = [_good(frame)]
     layers += [charts.line(frame, x, y[:, k], f"line {css}") for k, css in enumerate(("brown", "", "green"))]
     spread = float(np.sort(y, axis=1)[:, -2].max())
-    alt = f"{head}: the second largest class reaches {number(spread, 2)} of the largest"
-    return charts.panel(frame, layers, alt=alt, css="mb", title=title, units=("%", ""))
+    return charts.panel(
+        frame,
+        layers,
+        alt=f"{head}: the second largest class reaches {number(spread, 2)} of the largest",
+        css="mb",
+        title=title,
+        units=("%", ""),
+    )
 
 
 def _right(frame: charts.Frame, flow: np.ndarray, right: np.ndarray, place: str) -> Markup:
@@ -241,8 +253,15 @@ def _right(frame: charts.Frame, flow: np.ndarray, right: np.ndarray, place: str)
         charts.line(frame, flow, right),
         charts.dots(frame, flow, right, "dot whole dd", 2.4),
     ]
-    alt = f"Windows are named rightly in {number(float(right.min()), 0)} % at worst, between {place} of flow"
-    return charts.panel(frame, layers, alt=alt, css="dd", title="%", units=("%", "%"))
+    return charts.panel(
+        frame,
+        layers,
+        alt=f"Windows are named rightly in {number(float(right.min()), 0)} % at worst, between {place} of "
+        "flow",
+        css="dd",
+        title="%",
+        units=("%", "%"),
+    )
 
 
 def _good(frame: charts.Frame) -> Markup:
@@ -316,12 +335,15 @@ def _losses(learner: str, mine: Table, x: charts.Axis) -> Markup:
         for name, values, dy in (("learned from", training, 12), ("only watched", held_out, -5))
         if math.isfinite(values[-1])
     ]
-    alt = (
-        f"{learner}: the loss on segments that are only watched is least, "
-        f"{number(float(held_out[least]), 2)}, after {int(mine['epoch'][least])} epochs"
-    )
     return charts.panel(
-        frame, layers, alt=alt, css="dd wide", title="loss", x_ticks=False, units=("epochs", "")
+        frame,
+        layers,
+        alt=f"{learner}: the loss on segments that are only watched is least, "
+        f"{number(float(held_out[least]), 2)}, after {int(mine['epoch'][least])} epochs",
+        css="dd wide",
+        title="loss",
+        x_ticks=False,
+        units=("epochs", ""),
     )
 
 
@@ -540,17 +562,6 @@ def by_flow(sources: Sources) -> dict[str, Any]:
     metrics = sources.metrics["train_classifier"]
     found = bins(metrics)
     ideal = any(row.ideal == row.ideal for row in found)
-    rows = [
-        {
-            "place": place(row),
-            "beside": row.beside,
-            "right": quantity(row.right.value, "%", 0),
-            "band": band(row.right.low, row.right.high, 0),
-            "ideal": number(row.ideal, 0) if row.ideal == row.ideal else "not known",
-            "windows": f"{row.windows:,}",
-        }
-        for row in found
-    ]
     caption = (
         f"Bars: windows named rightly, by bins of 5{THIN}% of true flow; strokes: their 95{THIN}% intervals, "
         "by segment. Pale: a bin beside a border of the classes. Segments that nothing was learned, "
@@ -561,15 +572,28 @@ def by_flow(sources: Sources) -> dict[str, Any]:
             f" Dashed: an ideal reader of the drawn width, {number(IDEAL, 1)}{THIN}% over all bins: every "
             f"segment carries a width bias of {WIDTH_BIAS:g}{THIN}%, which no picture tells from flow."
         )
-    picture = Picture(
-        finding(found, known(lookup(metrics, "right_70_150"), None)),
-        [PictureColumn("Windows named rightly", "in per cent, by true flow", "", [_chart(found)])],
-        caption,
-        page.origin(sources.source("train_classifier")),
-        "by-flow",
-        BY_FLOW,
-    )
-    return {"picture": picture, "rows": rows, "ideal": ideal}
+    return {
+        "picture": Picture(
+            finding(found, known(lookup(metrics, "right_70_150"), None)),
+            [PictureColumn("Windows named rightly", "in per cent, by true flow", "", [_chart(found)])],
+            caption,
+            page.origin(sources.source("train_classifier")),
+            "by-flow",
+            BY_FLOW,
+        ),
+        "rows": [
+            {
+                "place": place(row),
+                "beside": row.beside,
+                "right": quantity(row.right.value, "%", 0),
+                "band": band(row.right.low, row.right.high, 0),
+                "ideal": number(row.ideal, 0) if row.ideal == row.ideal else "not known",
+                "windows": f"{row.windows:,}",
+            }
+            for row in found
+        ],
+        "ideal": ideal,
+    }
 
 
 def finding(rows: Sequence[Bin], every: Any) -> str:
@@ -627,12 +651,14 @@ def _chart(rows: Sequence[Bin]) -> Markup:
     if np.isfinite(ideal).any():
         layers.append(charts.line(frame, edges, ideal, "ref"))
     least = min(rows, key=lambda row: row.right.value)
-    alt = (
-        f"Windows are named rightly least often between {least.low:g} and {least.high:g} % of flow, "
-        f"{number(least.right.value, 0)} %"
-    )
     return charts.panel(
-        frame, layers, alt=alt, css="dd wide big", title="% of windows, against % of flow", units=("%", "%")
+        frame,
+        layers,
+        alt=f"Windows are named rightly least often between {least.low:g} and {least.high:g} % of flow, "
+        f"{number(least.right.value, 0)} %",
+        css="dd wide big",
+        title="% of windows, against % of flow",
+        units=("%", "%"),
     )
 
 

@@ -120,16 +120,13 @@ def _shares(mine: Table, x: charts.Axis, edges: np.ndarray, held: list[Held]) ->
         layers.append(Markup('<path class="{}" d="{}"/>').format(css, boxes))
         low = low + mine[column]
     layers += [_hatch(frame, float(px[stretch.begin]), float(px[stretch.end])) for stretch in held]
-    alt = (
-        f"Shares of under, good and over-extruded over {len(low)} windows: "
-        f"under peaks at {number(float(mine['p_under'].max()), 2)}, "
-        f"over at {number(float(mine['p_over'].max()), 2)}; "
-        f"{sum(stretch.end - stretch.begin for stretch in held)} windows were held"
-    )
     return charts.panel(
         frame,
         layers,
-        alt=alt,
+        alt=f"Shares of under, good and over-extruded over {len(low)} windows: "
+        f"under peaks at {number(float(mine['p_under'].max()), 2)}, "
+        f"over at {number(float(mine['p_over'].max()), 2)}; "
+        f"{sum(stretch.end - stretch.begin for stretch in held)} windows were held",
         css="mb strip-why",
         title="share of under (brown), good (grey), over (green); hatched: nothing may be sent",
         x_ticks=False,
@@ -170,16 +167,13 @@ def _flow(mine: Table, x: charts.Axis, held: list[Held], edges: np.ndarray) -> M
             Markup('<text x="{:.1f}" y="{}">{}</text>').format(start, frame.above + 9, f"held: {text}")
         )
         free = start + 6.2 * (len(text) + 8)
-    alt = (
-        f"True flow from {number(float(mine['flow_percent'][0]), 0)} to "
-        f"{number(float(mine['flow_percent'][-1]), 0)} %, between "
-        f"{number(float(mine['flow_percent'].min()), 0)} and "
-        f"{number(float(mine['flow_percent'].max()), 0)} %"
-    )
     return charts.panel(
         frame,
         layers,
-        alt=alt,
+        alt=f"True flow from {number(float(mine['flow_percent'][0]), 0)} to "
+        f"{number(float(mine['flow_percent'][-1]), 0)} %, between "
+        f"{number(float(mine['flow_percent'].min()), 0)} and "
+        f"{number(float(mine['flow_percent'].max()), 0)} %",
         css="dd strip-why",
         title="true flow, % (dashed: setpoint; grey: what is asked for)",
         x_ticks=False,
@@ -197,14 +191,11 @@ def _temperature(mine: Table, x: charts.Axis) -> Markup:
         charts.line(frame, mine["time_s"], mine["target_degC"], "ref", steps=True),
         charts.line(frame, mine["time_s"], mine["temperature_degC"]),
     ]
-    alt = (
-        f"Nozzle temperature from {number(float(mine['temperature_degC'][0]), 0)} to "
-        f"{number(float(mine['temperature_degC'][-1]), 0)} °C"
-    )
     return charts.panel(
         frame,
         layers,
-        alt=alt,
+        alt=f"Nozzle temperature from {number(float(mine['temperature_degC'][0]), 0)} to "
+        f"{number(float(mine['temperature_degC'][-1]), 0)} °C",
         css="dd strip-why",
         title="nozzle, °C (dashed: target)",
         x_ticks=False,
@@ -241,11 +232,11 @@ def _moves(mine: Table, x: charts.Axis) -> Markup:
                 f"{'+' if move > 0 else '−'}{number(abs(move), 0)} °C",
             )
         )
-    alt = f"{int(np.isfinite(moves).sum())} moves of the flow setpoint, {len(warm)} of the target temperature"
     return charts.panel(
         frame,
         layers,
-        alt=alt,
+        alt=f"{int(np.isfinite(moves).sum())} moves of the flow setpoint, {len(warm)} of the target "
+        "temperature",
         css="dd strip-why",
         title="moves that were sent: flow, points (strokes); target (lines with their °C)",
         units=("s", "points"),

@@ -200,10 +200,10 @@ def collect(
     )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
     read = linked(read)
-    stored = read_verdicts(verdicts, (*LOOPS, "identification"))
     return Sources(
         declared, figures, tables, read, absent, before, folders_of_code, night,
-        quick=artifacts.exists(QUICK_LOOK), stored=stored, certified=read_certificates(verdicts),
+        quick=artifacts.exists(QUICK_LOOK), stored=read_verdicts(verdicts, (*LOOPS, "identification")),
+        certified=read_certificates(verdicts),
     )  # fmt: skip
 
 

@@ -83,11 +83,14 @@ def _row(question: Question, judged: Judgement, names: Sequence[str]) -> dict[st
     best = (max if question.at_least else min)(values, default=math.nan)
     # a row in which all are alike has no best one
     led = len({worded(question, value, places) for value in values}) > 1
-    cells = [
-        _cell(question, figure, places, best, leads=led and name != IDLE)
-        for name, figure in zip(names, figures, strict=True)
-    ]
-    return {"title": question.title.split(", ")[0], "limit": limit_text(question), "cells": cells}
+    return {
+        "title": question.title.split(", ")[0],
+        "limit": limit_text(question),
+        "cells": [
+            _cell(question, figure, places, best, leads=led and name != IDLE)
+            for name, figure in zip(names, figures, strict=True)
+        ],
+    }
 
 
 def _cell(
@@ -99,8 +102,12 @@ def _cell(
     best_one = (
         leads and math.isfinite(best) and text == worded(question, best, places) and text != OFF_THE_SCALE
     )
-    bad = math.isfinite(question.limit) and state(question, figure) == FAILED
-    return cell(text, banded(question, figure, places), best=best_one, bad=bad)
+    return cell(
+        text,
+        banded(question, figure, places),
+        best=best_one,
+        bad=math.isfinite(question.limit) and state(question, figure) == FAILED,
+    )
 
 
 def _step(sources: Sources, verdict: Verdict) -> dict[str, str]:

@@ -102,15 +102,6 @@ def verdict_parts(judged: Judgement, *, claim: str = "") -> dict[str, Any]:
     states for the two contestants, and what changed since the accepted run; `claim` says under which
     condition it holds."""
     verdict = judged.verdict
-    rules = [
-        {
-            "rule": line[0].name[:1].upper() + line[0].name[1:],
-            "answers": groups()[line[0].name][1],
-            "states": [rule.state for rule in line],
-            "first": line[0].name == verdict.rule,
-        }
-        for line in verdict.rules
-    ]
     parameters = judged.changed.parameters if judged.changed else []
     changed = f"{count(len(parameters), 'parameter').capitalize()} changed since the accepted run"
     return {
@@ -120,7 +111,15 @@ def verdict_parts(judged: Judgement, *, claim: str = "") -> dict[str, Any]:
         "reason": verdict.reason,
         "remedy": verdict.remedy,
         "heads": heads((judged.subject, judged.rival)),
-        "rules": rules,
+        "rules": [
+            {
+                "rule": line[0].name[:1].upper() + line[0].name[1:],
+                "answers": groups()[line[0].name][1],
+                "states": [rule.state for rule in line],
+                "first": line[0].name == verdict.rule,
+            }
+            for line in verdict.rules
+        ],
         "claim": claim,
         "changed": changed if parameters else "",
     }

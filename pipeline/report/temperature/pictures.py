@@ -117,9 +117,13 @@ def _heat(
     past, zone = end
     layers = [charts.line(frame, time, run[f"{o.name}_reference"], "ref") for o in outputs]
     layers += [charts.line(frame, time, np.clip(run[o.name], -LARGEST, LARGEST), "line") for o in outputs]
-    alt = f"{heading(who)}: {zone} ends {_degrees(past)} from its reference, worst of {len(outputs)} zones"
     return charts.panel(
-        frame, layers, alt=alt, css=page.MARKS.get(who, "bl"), title="°C" if first else "", units=("s", "°C")
+        frame,
+        layers,
+        alt=f"{heading(who)}: {zone} ends {_degrees(past)} from its reference, worst of {len(outputs)} zones",
+        css=page.MARKS.get(who, "bl"),
+        title="°C" if first else "",
+        units=("s", "°C"),
     )
 
 
@@ -152,13 +156,15 @@ def _commands(sources: Sources, who: str, run: Table, most: float, *, first: boo
     at = np.stack(
         [(run[f"{i.name}_applied"] <= i.low) | (run[f"{i.name}_applied"] >= i.high) for i in machine.inputs]
     )
-    alt = (
-        f"{heading(who)}: commands from {number(float(np.nanmin(given)), 0)} to "
-        f"{number(float(np.nanmax(given)), 0)} %, "
-        f"at a limit {number(100 * float(at.mean()), 1)} % of the time"
-    )
     return charts.panel(
-        frame, layers, alt=alt, css=page.MARKS.get(who, "bl"), title="%" if first else "", units=("s", "%")
+        frame,
+        layers,
+        alt=f"{heading(who)}: commands from {number(float(np.nanmin(given)), 0)} to "
+        f"{number(float(np.nanmax(given)), 0)} %, "
+        f"at a limit {number(100 * float(at.mean()), 1)} % of the time",
+        css=page.MARKS.get(who, "bl"),
+        title="%" if first else "",
+        units=("s", "%"),
     )
 
 
@@ -248,12 +254,11 @@ def _slopes(both: pd.DataFrame, a: str, b: str, finding: str) -> Markup:
 def _boxes(cases: pd.DataFrame, names: list[str]) -> Markup:
     values = cases["cost"].to_numpy()
     x = _costs(values)
-    height = 34 * len(names) + 40
     frame = charts.Frame(
         x,
         charts.Axis(-0.5, len(names) - 0.5, ()),
         width=560,
-        height=height,
+        height=34 * len(names) + 40,
         left=130,
         above=10,
         below=22,
@@ -399,17 +404,22 @@ def _excitation(sources: Sources) -> Picture:
         edges = np.linspace(0, 1, len(levels) + 1)
         frame = charts.Frame(charts.Axis(0, 1, ((0, "0"), (1, "π"))), y, width=150, height=96, left=24)
         layer = charts.line(frame, edges, np.append(levels[:, i], levels[-1, i]), steps=True)
-        alt = (
-            f"{name}: level {number(float(levels[:, i].min()), 2)} to "
-            f"{number(float(levels[:, i].max()), 2)} % "
-            "in eight bands from 0 to π rad a step"
-        )
         shown.append(
             PictureColumn(
                 name,
                 "",
                 "",
-                [charts.panel(frame, [layer], alt=alt, title="%" if i == 0 else "", units=("of π", "%"))],
+                [
+                    charts.panel(
+                        frame,
+                        [layer],
+                        alt=f"{name}: level {number(float(levels[:, i].min()), 2)} to "
+                        f"{number(float(levels[:, i].max()), 2)} % "
+                        "in eight bands from 0 to π rad a step",
+                        title="%" if i == 0 else "",
+                        units=("of π", "%"),
+                    )
+                ],
             )
         )
     rank, full, order = (lookup(metrics, f"excitation_{key}") for key in ("rank", "full_rank", "order"))
@@ -450,8 +460,9 @@ def record(sources: Sources) -> Picture:
             values, masked = table[signal.name], table[f"{signal.name}_masked"]
             masked_total += int(masked.sum())
             set_point = set_points.get(set_point_of(signal.name))
-            last = i == len(signals) - 1
-            halves[half].append(_signal(signal, time, values, masked, quality, set_point, last=last))
+            halves[half].append(
+                _signal(signal, time, values, masked, quality, set_point, last=i == len(signals) - 1)
+            )
     recordings = count(len(np.unique(table["recording"])), "recording")
     masks = (
         f"{count(masked_total, 'value is', 'values are')} masked and not used"
@@ -527,11 +538,16 @@ def _signal(
     ] + layers
     flags = ", ".join(sorted({str(quality["kind"][i]) for i in mine}))
     unit = {"degC": "°C"}.get(signal.unit, signal.unit)
-    alt = (
-        f"{signal.name}: {short(low)} to {short(high)} {unit}, {count(int(masked.sum()), 'sample')} masked"
-    ) + (f"; flagged {flags}" if flags else "")
-    title = signal.name + (f": {flags}" if flags else "")
-    return charts.panel(frame, layers, alt=alt, css="mb", title=title, x_ticks=last, units=("s", unit))
+    return charts.panel(
+        frame,
+        layers,
+        alt=f"{signal.name}: {short(low)} to {short(high)} {unit}, {count(int(masked.sum()), 'sample')} "
+        f"masked{f'; flagged {flags}' if flags else ''}",
+        css="mb",
+        title=signal.name + (f": {flags}" if flags else ""),
+        x_ticks=last,
+        units=("s", unit),
+    )
 
 
 @as_table(rows=[], more=0)
@@ -541,23 +557,26 @@ def flaws(sources: Sources, most: int = 40) -> dict[str, Any]:
     quality = pd.DataFrame(table)
     quality = quality.assign(used=quality["kind"] != "quarantined", start=quality["start_s"].fillna(0.0))
     quality = quality.sort_values(["used", "recording", "signal", "kind", "start"])
-    rows = [
-        {
-            "recording": str(row["recording"]),
-            "signal": str(row["signal"]) or "whole recording",
-            "kind": str(row["kind"]),
-            "place": (
-                ""
-                if np.isnan(row["start_s"])
-                else f"{_seconds(row['start_s'])} to {_seconds(row['end_s'])}{THIN}s"
-            ),
-            "samples": number(float(row["count"]), 0),
-            "message": str(row["message"]),
-            "bad": row["kind"] == "quarantined",
-        }
-        for row in quality.head(most).to_dict("records")
-    ]
-    return {"rows": rows, "more": max(len(quality) - most, 0), "missing": None}
+    return {
+        "rows": [
+            {
+                "recording": str(row["recording"]),
+                "signal": str(row["signal"]) or "whole recording",
+                "kind": str(row["kind"]),
+                "place": (
+                    ""
+                    if np.isnan(row["start_s"])
+                    else f"{_seconds(row['start_s'])} to {_seconds(row['end_s'])}{THIN}s"
+                ),
+                "samples": number(float(row["count"]), 0),
+                "message": str(row["message"]),
+                "bad": row["kind"] == "quarantined",
+            }
+            for row in quality.head(most).to_dict("records")
+        ],
+        "more": max(len(quality) - most, 0),
+        "missing": None,
+    }
 
 
 def _seconds(value: float) -> str:

@@ -51,10 +51,11 @@ def scorecard(sources: Sources, judgement: Judgement, words: Mapping[str, str]) 
         gap = gap_of(metrics["evaluate_temperature"])
         raise Absent(gap or Missing("not measured", "No contestant was judged"))
     asked = {question.key: question for question in (*judgement.asked, *UNRULED)}
-    rows = [_row(sources, asked[key], judged, judgement, words.get(key, "")) for key in ORDER if key in asked]
     return {
         "heads": heads(judged),
-        "rows": rows,
+        "rows": [
+            _row(sources, asked[key], judged, judgement, words.get(key, "")) for key in ORDER if key in asked
+        ],
         "caption": _caption(sources),
         "below": [
             *filter(None, [_gap(compared, judged), _at_bound(compared, judged), _broken(compared, judged)]),
@@ -100,12 +101,16 @@ def _row(
     ]
     best = (max if question.at_least else min)(values, default=math.nan)
     alike = len(set(values)) < 2 or question.key == "data"
-    cells = [
-        _cell(sources, question, name, figure, best=not alike and getattr(figure, "value", None) == best)
-        for name, figure in zip(names, figures, strict=True)
-    ]
-    limit = "none" if question.key in ("crossings", "supervisor") else limit_text(question)
-    return {"key": question.key, "title": question.title, "word": word, "limit": limit, "cells": cells}
+    return {
+        "key": question.key,
+        "title": question.title,
+        "word": word,
+        "limit": "none" if question.key in ("crossings", "supervisor") else limit_text(question),
+        "cells": [
+            _cell(sources, question, name, figure, best=not alike and getattr(figure, "value", None) == best)
+            for name, figure in zip(names, figures, strict=True)
+        ],
+    }
 
 
 def _competes(name: str) -> bool:

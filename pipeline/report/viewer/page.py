@@ -114,5 +114,8 @@ def start(sources: Sources, judged: Judgement) -> dict[str, Any]:
 def still(sources: Sources, judged: Judgement) -> dict[str, Any]:
     """What stands where no script runs: the deciding case of the temperature loop, as page one draws it."""
     found = need(deciding(sources, judged, (360, 240), "The deciding case: "))
-    origin = page.files(sources.source("trajectories"))
-    return {"text": found.finding, "picture": found.drawn, "origin": origin}
+    return {
+        "text": found.finding,
+        "picture": found.drawn,
+        "origin": page.files(sources.source("trajectories")),
+    }
