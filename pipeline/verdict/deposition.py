@@ -347,8 +347,8 @@ def rules_of(case: Parts, beside: str = LIBRARY) -> tuple[Pair, ...]:
 
 
 def _rule(case: Parts, key: str, composer: str) -> Rule:
-    own = FIGURES.get(key)
-    rule = ask(LOOP, key, case.evidence, own and (lambda question: own(case, composer)), composer)
+    own = (lambda question: FIGURES[key](case, composer)) if key in FIGURES else None
+    rule = ask(LOOP, key, case.evidence, own, composer)
     gap = gap_of(rule.figure)
     if gap and gap.state == UNJUDGED:
         return rule._replace(question=None)

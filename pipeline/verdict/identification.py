@@ -97,13 +97,14 @@ def _needed(key: str, rule: Rule, use: str) -> bool:
 
 
 def _rule(evidence: Evidence, key: str) -> Rule:
-    row, own = rows(LOOP)[key], FIGURES.get(key)
+    row = rows(LOOP)[key]
+    own = (lambda question: FIGURES[key](evidence, question)) if key in FIGURES else None
     if key == AHEAD:
         words = ahead_words(evidence)
         row = row.model_copy(update={"name": words[:1].upper() + words[1:]})
-    rule = ask(LOOP, key, evidence, own and (lambda question: own(evidence, question)), row=row)
+    rule = ask(LOOP, key, evidence, own, row=row)
     if isinstance(rule.figure, Figure):
-        undecided = rule.state == UNDECIDED and row.unit == "%"
+        undecided = rule.question and rule.state == UNDECIDED and row.unit == "%"
         return rule._replace(remedy=_longer(rule.question, rule.figure)) if undecided else rule
     gap = rule.figure
     return rule._replace(

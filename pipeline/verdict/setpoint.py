@@ -236,8 +236,7 @@ def rules(evidence: Evidence, board: Board | None) -> tuple[Pair, ...]:
 def _rule(evidence: Evidence, board: Board | None, key: str, name: str, column: int) -> Rule:
     if control := CONTROL.get(key):
         return ask(LOOP, key, evidence, lambda question: control(evidence, board, name), name, undecided)
-    seeing = SEEING.get(key)
-    own = seeing and (lambda question: seeing(evidence, column))
+    own = (lambda question: SEEING[key](evidence, column)) if key in SEEING else None
     return ask(LOOP, key, evidence, own, name, undecided)
 
 
@@ -381,8 +380,8 @@ def _accuracy(evidence: Evidence, column: int) -> Reading:
 def accuracy(metrics: Mapping | Missing, name: str) -> Figure | Missing:
     """In percent, with the interval where the stage gives one."""
     percent = 100 * need_figure(metrics, f"{name}_accuracy")
-    ends = known(lookup(metrics, f"intervals_percent.{name}"), (percent, percent))
-    return Figure(percent, *map(float, ends))
+    low, high = known(lookup(metrics, f"intervals_percent.{name}"), (percent, percent))
+    return Figure(percent, float(low), float(high))
 
 
 def _calibration(*keys: str) -> Callable[[Evidence, int], Reading]:

@@ -37,7 +37,7 @@ from pipeline.verdict.deposition import (
 )
 from pipeline.verdict.digits import THIN, band, count, decimals, number
 from pipeline.verdict.evidence import Table, known, lookup, need, or_gap, or_nothing
-from pipeline.verdict.verdict import PASSED, Figure, Missing, Question, Verdict
+from pipeline.verdict.verdict import PASSED, Figure, Missing, Question, Verdict, count_of
 
 MOVES = "Plunger command to flow at the nozzle"
 # how long a stretch of a part is drawn, s
@@ -211,7 +211,7 @@ def _move(sources: Sources, structure: Structure) -> Move:
     if score is None:
         why = NOT_JUDGED if structure.unknown() else "not measured"
         return Move(question, before, Missing("not measured", "nothing to compare"), False, why)
-    now = Figure(score.error, score.error, score.error)
+    now = count_of(score.error)
     if before is None:
         return Move(question, None, now, False, "new")
     if before.value == now.value:
@@ -226,7 +226,7 @@ def _accepted(sources: Sources, structure: Structure) -> Figure | None:
     parts = known(lookup(sources.accepted, "metrics.compose_parts"), {})
     then = parts.get(structure.part, {}).get(structure.material, {})
     score = then.get(then.get("chosen"))
-    return Figure(*3 * (float(score["rms_percent_of_on_off"]),)) if score else None
+    return count_of(float(score["rms_percent_of_on_off"])) if score else None
 
 
 def sentence(moves: Sequence[Move]) -> str:

@@ -77,8 +77,8 @@ def loop_state(sources: Sources) -> dict[str, Any]:
         "head": "No feedback was recognised.",
         "test": test,
         "follows": "The model is identified as from an open loop. A weak proportional controller whose "
-        "set-point never moves stays below this test: where the machine had one, believe the fit some steps ahead before the "
-        "simulation.",
+        "set-point never moves stays below this test: where the machine had one, believe the fit some steps "
+        "ahead before the simulation.",
     }
 
 
@@ -238,7 +238,8 @@ def _pairs(sources: Sources) -> dict[str, Any]:
     every = f"of {count(len(gaps), 'pair')}"
     return {
         "finding": f"{count(fitted, every, every).capitalize()} {'has' if fitted == 1 else 'have'} a gain of "
-        "known sign and a time constant that the record shows. Bold: the input that moves an output furthest.",
+        "known sign and a time constant that the record shows. Bold: the input that moves an output "
+        "furthest.",
         "outputs": [_output_pairs(table, gaps, output.name) for output in sources.declared.machine.outputs],
     }
 

@@ -392,12 +392,12 @@ def _response(
     }
 
 
-def _places(values: tuple[float, float, float]) -> int:
+def _places(values: Sequence[float]) -> int:
     value, low, high = values
     return decimals(low, high, value=value)
 
 
-def _span(values: tuple[float, float, float]) -> str:
+def _span(values: Sequence[float]) -> str:
     return band(values[1], values[2], _places(values))
 
 

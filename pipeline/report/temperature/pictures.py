@@ -391,7 +391,7 @@ def _excitation(sources: Sources) -> Picture:
         lookup(sources.metrics[stage], "next_experiment") if sources.recorded else sources.metrics[stage]
     )
     if sources.recorded and entry(metrics, "written") is False:
-        raise Absent(Missing(UNJUDGED, f"Not written: {metrics['reason']}"))
+        raise Absent(Missing(UNJUDGED, f"Not written: {entry(metrics, 'reason')}"))
     levels, machine = np.array(need_figure(metrics, "level_percent_per_band")), sources.declared.machine
     y = charts.linear(0, 1.1 * float(levels.max()), ticks=3)
     names = (
