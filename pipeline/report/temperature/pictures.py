@@ -238,7 +238,7 @@ def _slopes(both: pd.DataFrame, a: str, b: str, finding: str) -> Markup:
         charts.Axis(0, 1, ((0.15, heading(a)), (0.85, heading(b)))),
         y,
         width=420,
-        height=300,
+        height=210,
         left=44,
         above=20,
     )
@@ -310,7 +310,7 @@ def record_length(sources: Sources) -> Picture:
         charts.Axis(minutes[0] / 1.2, minutes[-1] * 1.9, ticks, log=True),
         _costs(every[np.isfinite(every)]),
         width=720,
-        height=320,
+        height=220,
         left=44,
         below=34,
         above=20,
