@@ -478,19 +478,13 @@ def verdict(evidence: Evidence) -> Verdict:
     if first is None:
         return settled
     failed = first.state == FAILED
-    # a rule of the classifier holds whoever controls
-    reason = (
-        f"{first.reason} By runs that settle and stay {name} comes closest."
-        if of_classifier(first)
-        else f"Judged is {name}: {first.reason[:1].lower()}{first.reason[1:]}"
-    )
     return settled._replace(
         winner=None if refusal else scores.default,
         subject=scores.default,
         state=ended,
         decision=words.of(ended),
         lead=f"First {'failed' if failed else 'undecided'} rule: {first.name[:1].lower()}{first.name[1:]}.",
-        reason=reason,
+        reason=_closest(name, first),
         remedy=_conditions(asked, claim == CLAIM),
         rule=first.name,
     )
@@ -535,6 +529,15 @@ def _conditions(asked: Sequence[Rule], rendered: bool) -> str:
     real = " Recordings of the real printer: none are in (datasets/raw/setpoint)." if rendered else ""
     remedies = dict.fromkeys(rule.remedy for rule in short if rule.remedy)
     return f"Before it may: {', '.join(figures)}.{real} To try: {' '.join(remedies)}"
+
+
+def _closest(name: str, rule: Rule) -> str:
+    """Who comes closest, and how far it is off; a rule of the classifier holds whoever controls."""
+    return (
+        f"{rule.reason} By runs that settle and stay {name} comes closest."
+        if of_classifier(rule)
+        else f"Judged is {name}: {rule.reason[:1].lower()}{rule.reason[1:]}"
+    )
 
 
 def named(board: Board, name: str) -> str:
