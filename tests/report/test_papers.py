@@ -328,8 +328,8 @@ def test_the_setpoint_results_are_of_the_settings_in_force():
 
 
 def test_all_pages_tell_the_same_figures_of_one_agent():
-    """The search, the kept agent that the setpoint page shows, and the papers' page. An agent of an earlier search
-    stays where it did better on the validation runs than the best of this one."""
+    """The search, the kept agent that the setpoint page shows, and the papers' page. An agent of an earlier
+    search stays where it did better on the validation runs than the best of this one."""
     searched = json.loads(SEARCHED.read_text(encoding="utf-8"))
     phase_4 = results("setpoint")["agents"]["phase_4"]
     kept = json.loads((ROOT / "datasets/papers/train_agent/figures.json").read_text(encoding="utf-8"))
