@@ -121,7 +121,7 @@ def main() -> None:
     from pipeline.report.about import page as about_page
     from pipeline.report.index import page as index_page
     from pipeline.report.papers import page as papers_page
-    from pipeline.report.runs import curves, figures
+    from pipeline.report.runs import figures
     from pipeline.report.runs import page as runs_page
     from pipeline.report.shared.sources import Declared, collect, digest
     from pipeline.report.temperature.judgement import judgement, shown
@@ -168,7 +168,7 @@ def main() -> None:
         artifacts.write_text("reports/runs.html", pages["runs"])
         artifacts.write_text("reports/words.html", pages["words"])
         # `accept` keeps these
-        drawn = curves.as_json(curves.curves(sources.tables))
+        drawn = figures.as_json(figures.curves(sources.tables))
         artifacts.write_folder("reports/data", {**viewer.files, "curves.json": drawn})
         artifacts.write_metrics(
             "report",

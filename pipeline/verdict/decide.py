@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from pipeline.verdict import identification
 from pipeline.verdict.controllers import YARDSTICKS, heading, in_a_sentence
 from pipeline.verdict.digits import with_unit
-from pipeline.verdict.evidence import Evidence, Figures, entry
+from pipeline.verdict.evidence import Evidence, Figures, entry, gap_of
 from pipeline.verdict.pairs import pair_names, pair_sentence, reference_of
 from pipeline.verdict.rules import judge, rows
 from pipeline.verdict.settings import ReportRules
@@ -267,9 +267,8 @@ def _beaten(figures: Figures, held: Mapping[str, Standing]) -> str:
 def _nothing(evidence: Evidence, words: Words, drift: Figure | Missing, named: str) -> Verdict:
     a, b = pair_names(evidence.figures)
     lines = _lines(*(_standing(evidence, name, drift).rules for name in (a, b)))
-    gap = evidence.figures.get("evaluate_temperature")
     nobody = f"{name_first(named)} was not judged" if named else "No contestant was judged"
-    why = gap if isinstance(gap, Missing) else Missing(OPEN, nobody)
+    why = gap_of(evidence.figures.get("evaluate_temperature")) or Missing(OPEN, nobody)
     first = next(iter(groups()))
     return Verdict(
         LOOP,
@@ -305,7 +304,7 @@ def _passed(
         if winner.name == incumbent != best and best
         else ""
     )
-    later = "" if everything or not isinstance(drift.figure, Missing) else _drift_sentence(drift)
+    later = "" if everything else _drift_sentence(drift)
     next_step = (
         "Next: a supervised trial, somebody at the machine throughout."
         if recorded
@@ -373,10 +372,9 @@ def _worst_case(figures: Figures, name: str, rule: Rule) -> str:
 
 
 def _drift_sentence(rule: Rule) -> str:
-    figure = rule.figure
-    if not isinstance(figure, Missing):
-        return ""
-    return figure.sentence() if rule.state == FAILED else f"Drift is {rule.state}. {figure.sentence()}"
+    gap = gap_of(rule.figure)
+    told = gap.sentence() if gap else ""
+    return told if not gap or rule.state == FAILED else f"Drift is {rule.state}. {told}"
 
 
 def _closest_limit(standing: Standing) -> str:
@@ -392,7 +390,9 @@ def _closest_limit(standing: Standing) -> str:
     ]
     if not asked:
         return ""
-    question, figure = min(asked, key=lambda pair: -share(pair[0], _worst_end(*pair)))
+    question, figure = max(
+        asked, key=lambda pair: share(pair[0], pair[1].low if pair[0].at_least else pair[1].high)
+    )
     places = places_of(question, [figure])
     whose = " of the weakest tenth of plants" if question.key in MARGINS else ""
     return (
@@ -413,10 +413,6 @@ def _worst_margins(compared: Mapping[str, Any], winner: Standing) -> str:
             least = with_unit(question.limit, question.unit, 2)
             parts.append(f"{question.rule} {with_unit(worst, question.unit, 2)} of {least}")
     return f"Below the limit on the worst plant: {', '.join(parts)}." if parts else ""
-
-
-def _worst_end(question: Question, figure: Figure) -> float:
-    return figure.low if question.at_least else figure.high
 
 
 # ---- the model first

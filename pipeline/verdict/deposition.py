@@ -10,8 +10,8 @@ import pandas as pd
 from pipeline import statistics
 from pipeline.deposition.controllers import COMPOSERS as TABLE
 from pipeline.verdict.digits import THIN, band, count, number, percent, short
-from pipeline.verdict.evidence import Evidence, Figures, lookup, need
-from pipeline.verdict.rules import Reading, Row, at_path, judge, rows
+from pipeline.verdict.evidence import Evidence, Figures, gap_of, instead, known, lookup, need, or_gap
+from pipeline.verdict.rules import Reading, ask, rows
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import (
     FAILED,
@@ -83,7 +83,7 @@ def of_recorded_trials(figures: Figures, tables: Mapping[str, Any]) -> dict[str,
     scores, gap = tables["scores"], None
     if untried(figures):
         gap = Missing("not measured", "No trial is recorded yet")
-    elif not isinstance(scores, Missing) and REFERENCE in scores["composer"]:
+    elif REFERENCE in known(scores, {"composer": ()})["composer"]:
         gap = Missing("stale", "It was made from simulated trials", "Run ./run dvc repro compose_parts")
     return dict(tables) if gap is None else {**tables, **dict.fromkeys(set(COMPOSED) & set(tables), gap)}
 
@@ -156,24 +156,18 @@ class Structure(NamedTuple):
         return PASSED if score.judged else OPEN
 
 
+@or_gap
 def structures(evidence: Evidence) -> list[Structure] | Missing:
     """Every material of every part, in the order of the table."""
-    table = evidence.tables["scores"]
-    if isinstance(table, Missing):
-        return table
-    groups = pd.DataFrame(table).groupby(["part", "material"], sort=False)
-    conformance = evidence.tables["conformance"]
-    told = {} if isinstance(conformance, Missing) else conformance
+    groups = pd.DataFrame(need(evidence.tables["scores"])).groupby(["part", "material"], sort=False)
+    told = known(evidence.tables["conformance"], {})
     parts = [_structure(rows, evidence.rules, told) for _, rows in groups]
     return parts or Missing("not measured", "no part was composed", "Copy a part program to datasets/parts")
 
 
 def unknown_streams(evidence: Evidence) -> set[tuple[str, str]]:
     """(part, material) of the forecasts that nobody may show a figure of."""
-    parts = structures(evidence)
-    return {
-        (part.part, part.material) for part in ([] if isinstance(parts, Missing) else parts) if part.unknown()
-    }
+    return {(part.part, part.material) for part in known(structures(evidence), []) if part.unknown()}
 
 
 def _structure(rows: pd.DataFrame, rules: ReportRules, conformance: Mapping[str, Any]) -> Structure:
@@ -230,13 +224,12 @@ def winner(parts: Sequence[Structure]) -> str:
 # ---- model-based against data-driven
 
 
+@instead(lambda gap: PairSentence("Model-based against data-driven: not measured.", None))
 def pair_sentence(evidence: Evidence) -> PairSentence:
     """ "the basis functions leave 0.25 of the flow error that the library by superposition leaves", on the
     same streams, from how many prints on, and after how many prints of a part itself learning it is as good;
     or that more parts are needed to tell."""
-    head, parts = "Model-based against data-driven:", structures(evidence)
-    if isinstance(parts, Missing):
-        return PairSentence(f"{head} not measured.", None)
+    head, parts = "Model-based against data-driven:", need(structures(evidence))
     if evidence.recorded("train_ilc"):
         return PairSentence(
             f"{head} forecasts cannot tell, as they come from the chain that the basis functions invert; "
@@ -349,25 +342,17 @@ def rules(evidence: Evidence, parts: Sequence[Structure], beside: str = LIBRARY)
 def rules_of(case: Parts, beside: str = LIBRARY) -> tuple[Pair, ...]:
     """The drive first, then what may be believed. If the drive cannot follow, a signal is held against the
     best that any command could reach within it, else against the flow that is wanted."""
-    asked = {key: row for key, row in rows(LOOP).items() if key != "near" or case.bound}
-    return tuple((_rule(case, key, row, OURS), _rule(case, key, row, beside)) for key, row in asked.items())
+    asked = [key for key in rows(LOOP) if key != "near" or case.bound]
+    return tuple((_rule(case, key, OURS), _rule(case, key, beside)) for key in asked)
 
 
-def _rule(case: Parts, key: str, row: Row, composer: str) -> Rule:
-    question = row.question(key, row.limit(case.evidence.rules))
-
-    def read() -> Reading:
-        if key in FIGURES:
-            return FIGURES[key](case, composer)
-        path = row.figure.format(controller=composer)
-        return at_path(case.evidence.figures, path, at_least=question.at_least), {}
-
-    rule = judge(row, question, read)
-    if not isinstance(rule.figure, Missing):
-        return rule
-    if rule.figure.state == UNJUDGED:
+def _rule(case: Parts, key: str, composer: str) -> Rule:
+    own = (lambda question: FIGURES[key](case, composer)) if key in FIGURES else None
+    rule = ask(LOOP, key, case.evidence, own, composer)
+    gap = gap_of(rule.figure)
+    if gap and gap.state == UNJUDGED:
         return rule._replace(question=None)
-    return rule._replace(figure=rule.figure._replace(state=OPEN))
+    return rule._replace(figure=gap._replace(state=OPEN)) if gap else rule
 
 
 def _open(text: str = OPEN, reason: str = "", **words: str) -> Reading:
@@ -386,7 +371,7 @@ def _largest(
 def _worst_of(
     parts: Sequence[Structure],
     value: Callable[[Structure], float | None],
-    worded: Callable[[float], str],
+    worded: Callable[[float], str] = lambda value: percent(value, 2),
     shown: Callable[[str], str] = str,
 ) -> Reading:
     """The largest value of the parts; open if one of the parts is not known."""
@@ -399,18 +384,12 @@ def _worst_of(
     return count_of(pair[0]), {"text": shown(text), "value": text, "where": where(pair[1])}
 
 
-def _two_digits(value: float) -> str:
-    return percent(value, 2)
-
-
 def _flow(case: Parts, composer: str) -> Reading:
-    return _worst_of(case.followed, lambda part: part.error(composer), _two_digits)
+    return _worst_of(case.followed, lambda part: part.error(composer))
 
 
 def _line(case: Parts, composer: str) -> Reading:
-    return _worst_of(
-        case.followed, lambda part: part.worst_line(composer), _two_digits, lambda text: f"±{text}"
-    )
+    return _worst_of(case.followed, lambda part: part.worst_line(composer), shown="±{}".format)
 
 
 def _near(case: Parts, composer: str) -> Reading:
@@ -422,11 +401,14 @@ def _near(case: Parts, composer: str) -> Reading:
 
     bounded = [part for part in case.parts if (part.part, part.material) in case.bound]
     figure, words = _worst_of(bounded, ratio, lambda value: f"{number(value, 2)} ×")
-    if isinstance(figure, Missing):
+    if gap_of(figure):
         return figure, words
     part = max((part for part in bounded if ratio(part) is not None), key=lambda part: ratio(part) or 0.0)
-    least = percent(case.bound[part.part, part.material], 2)
-    return figure, {**words, "value": percent(part.scores[composer].error, 2), "least": least}
+    return figure, {
+        **words,
+        "value": percent(part.scores[composer].error, 2),
+        "least": percent(case.bound[part.part, part.material], 2),
+    }
 
 
 def _above(case: Parts, composer: str) -> Reading:
@@ -440,8 +422,11 @@ def _above(case: Parts, composer: str) -> Reading:
     if pair is None:
         return _open()
     points, part = pair
-    text = f"{'+' if points > 0 else '−'}{number(abs(points), 1)} points"
-    return count_of(points), {"text": text, "value": number(points, 1), "where": where(part)}
+    return count_of(points), {
+        "text": f"{'+' if points > 0 else '−'}{number(abs(points), 1)} points",
+        "value": number(points, 1),
+        "where": where(part),
+    }
 
 
 def _forecast(case: Parts, composer: str) -> Reading:
@@ -479,11 +464,8 @@ def _learning(case: Parts, composer: str) -> Reading:
 
 def _each(evidence: Evidence, key: str) -> list[float]:
     """A figure of every material that has it."""
-    learning = evidence.figures["train_ilc"]
-    figures = (
-        [] if isinstance(learning, Missing) else [lookup(material, key) for material in learning.values()]
-    )
-    return [float(value) for value in figures if not isinstance(value, Missing)]
+    figures = [lookup(material, key) for material in known(evidence.figures["train_ilc"], {}).values()]
+    return [float(value) for value in figures if not gap_of(value)]
 
 
 def gamma(evidence: Evidence) -> dict[str, float] | None:
@@ -601,12 +583,9 @@ def _drive(case: Parts, composer: str) -> Reading:
 def _bound(evidence: Evidence) -> dict[tuple[str, str], float]:
     """The least error in % of on-off control's that any command leaves, by part and material, of the streams
     that the drive cannot follow."""
-    conformance = evidence.tables["conformance"]
-    if isinstance(conformance, Missing):
-        return {}
     return {
         (part, material): float(saturation["least_percent"])
-        for part, report in conformance.items()
+        for part, report in known(evidence.tables["conformance"], {}).items()
         for material, saturation in report.get("saturation", {}).items()
         if not saturation["enough"] and saturation.get("least_percent") is not None
     }
@@ -723,17 +702,6 @@ def _lead(state: str, first: Rule | None, judged: int, *, condition: bool) -> st
     return f"All {count(judged, 'rule')} {'that can be judged ' if condition else ''}passed."
 
 
-def _peak(evidence: Evidence) -> float:
-    """The largest command of our laws over the steady one; 0 where none was learned."""
-    learning = evidence.figures["train_ilc"]
-    learned = (
-        []
-        if isinstance(learning, Missing)
-        else [laws[law] for laws in learning.values() for law in ("model_inverse", "pixels") if law in laws]
-    )
-    return max((law["peak_over_steady"] for law in learned), default=0.0)
-
-
 def _summary(parts: Sequence[Structure], use: str, machine: bool) -> str:
     """The composer in use with its worst figure, in % of on-off control's, and its worst line."""
     found = worst(parts, use)
@@ -766,20 +734,15 @@ def _bare(name: str) -> str:
 def _price(evidence: Evidence, parts: Sequence[Structure]) -> str:
     """What the signals cost: trials, peak command, what the paper's law would have done,
     and the lines that the priority rule would lose."""
-    learning, sentences = evidence.figures["train_ilc"], []
-    if not isinstance(learning, Missing):
-        learned = [
-            laws[law] for laws in learning.values() for law in ("model_inverse", "pixels") if law in laws
-        ]
-        routines = max((len(laws.get("other_routines", [])) for laws in learning.values()), default=0)
-        if learned:
-            trials, peak = max(law["trials"] for law in learned), _peak(evidence)
-            of = (
-                f"{count(routines, 'routine')} of {trials + 1} trials" if routines else f"{trials + 1} trials"
-            )
-            sentences.append(
-                f"Price: {of} for each material, and commands up to {number(peak, 0)} times the steady one."
-            )
+    learning, sentences = known(evidence.figures["train_ilc"], {}).values(), []
+    learned = [laws[law] for laws in learning for law in ("model_inverse", "pixels") if law in laws]
+    if learned:
+        routines = max(len(laws.get("other_routines", [])) for laws in learning)
+        trials, peak = (max(law[key] for law in learned) for key in ("trials", "peak_over_steady"))
+        of = f"{count(routines, 'routine')} of {trials + 1} trials" if routines else f"{trials + 1} trials"
+        sentences.append(
+            f"Price: {of} for each material, and commands up to {number(peak, 0)} times the steady one."
+        )
     before = gamma(evidence)
     if before:
         safe = before["gamma_worst"] < 1
@@ -789,12 +752,8 @@ def _price(evidence: Evidence, parts: Sequence[Structure]) -> str:
             f"above 1 on {percent(before['gamma_above_1_percent'], 2)}: "
             f"{'it may be run' if safe else 'do not run it'} on this machine."
         )
-    conformance = evidence.tables["conformance"]
-    short = (
-        {}
-        if isinstance(conformance, Missing)
-        else {part: report.get("shorter_than_lead", 0) for part, report in conformance.items()}
-    )
+    reports = known(evidence.tables["conformance"], {})
+    short = {part: report.get("shorter_than_lead", 0) for part, report in reports.items()}
     sentences += [
         f"{count(n, 'line', 'lines').capitalize()} of {part} {'is' if n == 1 else 'are'} shorter than the "
         f"lead: the priority rule would not print {'it' if n == 1 else 'them'}."

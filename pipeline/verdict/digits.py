@@ -3,6 +3,7 @@ units, "never" for what never comes."""
 
 import math
 import re
+from collections.abc import Sequence
 
 MINUS, THIN, DASH = "\u2212", "\u202f", "\u2013"
 
@@ -89,7 +90,7 @@ def short(value: float, digits: int = 3) -> str:
     exponent = math.floor(math.log10(abs(value)))
     if -4 <= exponent < 7:
         return number(value, min(max(digits - 1 - exponent, 0), 9))
-    return f"{number(value / 10.0**exponent, digits - 1)} × 10{_superscript(exponent)}"
+    return f"{number(value / 10.0**exponent, digits - 1)} × {power_of_ten(exponent)}"
 
 
 def percent(value: float, digits: int = 3) -> str:
@@ -97,8 +98,9 @@ def percent(value: float, digits: int = 3) -> str:
     return beyond_meaning(value, "%") or short(value, digits) + THIN + "%"
 
 
-def _superscript(exponent: int) -> str:
-    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+def power_of_ten(exponent: int) -> str:
+    """ "10⁻³"."""
+    return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def count(value: int, one: str, many: str = "") -> str:
@@ -122,6 +124,11 @@ def count(value: int, one: str, many: str = "") -> str:
         f"{words[value] if 0 <= value < len(words) else f'{value:,}'} "
         f"{one if value == 1 else many or one + 's'}"
     )
+
+
+def listed(names: Sequence[str]) -> str:
+    """ "a", "a and b", "a, b and c"."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def shortened(text: str, longest: int = 60) -> str:

@@ -1,6 +1,7 @@
 """What a verdict is made from, and how a figure is found in it."""
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -77,6 +78,38 @@ def need(value: Value | Missing) -> Value:
     return value
 
 
-def need_figure(data: Any, dotted: str) -> Any:
+def need_figure(data: Any, dotted: str, *, what: str = "") -> Any:
     """data["a"]["b"] of "a.b". Raises Absent if it is not there."""
-    return need(lookup(data, dotted))
+    return need(lookup(data, dotted, what=what))
+
+
+def known(value: Value | Missing, otherwise: Any) -> Value:
+    """The value itself; `otherwise` if it is a Missing."""
+    return otherwise if isinstance(value, Missing) else value
+
+
+def gap_of(value: Any) -> Missing | None:
+    """Why a value is missing; None if it is there."""
+    return value if isinstance(value, Missing) else None
+
+
+def instead(make: Callable[[Missing], Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """A decorator: what a function gives, or what `make` makes of the gap if the function needs something
+    that is absent."""
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def guarded(*args: Any, **options: Any) -> Any:
+            try:
+                return function(*args, **options)
+            except Absent as absent:
+                return make(absent.gap)
+
+        return guarded
+
+    return decorate
+
+
+# in the place of what needs something that is absent: the gap itself, nothing to say, no rows
+or_gap, or_nothing, or_none = instead(lambda gap: gap), instead(lambda gap: ""), instead(lambda gap: None)
+or_empty, or_no_entries = instead(lambda gap: []), instead(lambda gap: {})

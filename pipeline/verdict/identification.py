@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.verdict.digits import THIN, band, count, decimals, number, quantity, short
-from pipeline.verdict.evidence import Evidence, lookup, need, need_figure
-from pipeline.verdict.rules import Reading, at_path, judge, rows
+from pipeline.verdict.digits import THIN, band, count, decimals, listed, number, quantity, short
+from pipeline.verdict.evidence import Evidence, entry, gap_of, instead, known, lookup, need, need_figure
+from pipeline.verdict.rules import Reading, ask, rows
 from pipeline.verdict.verdict import (
     FAILED,
     PASSED,
@@ -44,7 +44,8 @@ class Fit(NamedTuple):
 def trust(evidence: Evidence) -> Verdict:
     """Which uses the model is good for. A use is passed if each rule that it needs is passed."""
     ahead = ahead_words(evidence)
-    rules = {key: _rule(evidence, key) for key in rows(LOOP) if key != GAINS or _heaters(evidence)}
+    heats = any(signal.heats for signal in evidence.machine.inputs)
+    rules = {key: _rule(evidence, key) for key in rows(LOOP) if key != GAINS or heats}
     uses = {
         words: worst_state([rule.state for key, rule in rules.items() if _needed(key, rule, use)])
         for use, words in (
@@ -97,24 +98,18 @@ def _needed(key: str, rule: Rule, use: str) -> bool:
 
 def _rule(evidence: Evidence, key: str) -> Rule:
     row = rows(LOOP)[key]
+    own = (lambda question: FIGURES[key](evidence, question)) if key in FIGURES else None
     if key == AHEAD:
         words = ahead_words(evidence)
         row = row.model_copy(update={"name": words[:1].upper() + words[1:]})
-    question = row.question(key, row.limit(evidence.rules))
-
-    def read() -> Reading:
-        if key in FIGURES:
-            return FIGURES[key](evidence, question)
-        return at_path(evidence.figures, row.figure, at_least=question.at_least), {}
-
-    rule = judge(row, question, read)
+    rule = ask(LOOP, key, evidence, own, row=row)
     if isinstance(rule.figure, Figure):
-        asked = rule.question or question
-        undecided = rule.state == UNDECIDED and asked.unit == "%"
-        return rule._replace(remedy=_longer(asked, rule.figure)) if undecided else rule
+        undecided = rule.question and rule.state == UNDECIDED and row.unit == "%"
+        return rule._replace(remedy=_longer(rule.question, rule.figure)) if undecided else rule
     gap = rule.figure
-    remedy = gap.remedy and gap.remedy.rstrip(".") + "."
-    return rule._replace(reason=gap.reason.rstrip(".") + ".", remedy=remedy)
+    return rule._replace(
+        reason=gap.reason.rstrip(".") + ".", remedy=gap.remedy and gap.remedy.rstrip(".") + "."
+    )
 
 
 def _decision(uses: Mapping[str, str]) -> str:
@@ -129,12 +124,8 @@ def _decision(uses: Mapping[str, str]) -> str:
     ]
     return (
         "Trust this model "
-        f"{_listed(good)}{''.join(f', {word} {_listed(group)}' for word, group in groups if group)}."
+        f"{listed(good)}{''.join(f', {word} {listed(group)}' for word, group in groups if group)}."
     )
-
-
-def _listed(items: Sequence[str]) -> str:
-    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
 
 
 # ---- the figures
@@ -158,34 +149,35 @@ def fits(evidence: Evidence) -> list[Fit]:
 def fit_figure(model: Any, key: str, name: str) -> Figure | Missing:
     """The fit `key` of an output in percent, with its band."""
     value = lookup(model, f"{key}.{name}")
-    if isinstance(value, Missing):
-        if isinstance(model, Missing) or key not in ("fit_holdout_ahead", "fit_holdout_held"):
-            return value
+    if gap := gap_of(value):
+        if gap_of(model) or key not in ("fit_holdout_ahead", "fit_holdout_held"):
+            return gap
         return Missing(
             "not measured",
             "no stretch of the hold-out outlasts the start-up of the prediction",
             "Record longer, or lower ahead_steps",
         )
-    ends = lookup(model, f"{key}_band.{name}")
-    return Figure(value, *([value, value] if isinstance(ends, Missing) else ends))
+    return Figure(value, *known(lookup(model, f"{key}_band.{name}"), [value, value]))
 
 
+@instead(lambda gap: "ahead")
 def ahead_words(evidence: Evidence) -> str:
     """ "60 s ahead"."""
-    steps = lookup(evidence.figures["identify_plant"], "ahead_steps")
-    return (
-        "ahead"
-        if isinstance(steps, Missing)
-        else f"{steps * evidence.machine.sample_time_s:g}{THIN}s\u00a0ahead"
-    )
+    steps = need_figure(evidence.figures["identify_plant"], "ahead_steps")
+    return f"{steps * evidence.machine.sample_time_s:g}{THIN}s\u00a0ahead"
 
 
-def percent_of(figure: Figure) -> str:
+def percent_of(figure: Figure | Missing) -> str:
+    """A fit with its unit; the state of one that is missing."""
+    if isinstance(figure, Missing):
+        return figure.state
     return quantity(figure.value, "%", min(decimals(figure.low, figure.high, value=figure.value), 1))
 
 
-def band_of(figure: Figure) -> str:
-    """Its ends, empty where they are one."""
+def band_of(figure: Figure | Missing) -> str:
+    """Its ends, empty where they are one, and where it is missing."""
+    if isinstance(figure, Missing):
+        return ""
     places = min(decimals(figure.low, figure.high, value=figure.value), 1)
     return band(figure.low, figure.high, places, unit="%")
 
@@ -256,10 +248,11 @@ def _residuals(evidence: Evidence, rows: np.ndarray) -> Reading:
     worst, excess = _worst_lag(table, rows)
     if worst is None:
         return count_of(0), {}
+    correlation = float(table["correlation"][worst])
     words = {
         "output": table["output"][worst],
         "input": table["against"][worst],
-        "correlation": _signed(table["correlation"][worst]),
+        "correlation": f"{'+' if correlation > 0 else ''}{number(correlation, 2)}",
         "lag": int(table["lag"][worst]),
         "times": short(excess, 2),
     }
@@ -293,18 +286,14 @@ def _worst_lag(table: Mapping[str, np.ndarray], rows: np.ndarray) -> tuple[int |
     return int(excess.argmax()), float(excess.max())
 
 
-def _signed(value: float) -> str:
-    return ("+" if value > 0 else "") + number(float(value), 2)
-
-
 def _excitation(evidence: Evidence, question: Question) -> Reading:
     model = evidence.figures["identify_plant"]
     rank, full = need_figure(model, "excitation.rank"), need_figure(model, "excitation.full")
-    lags, poor = lookup(model, "excitation.lags"), ""
-    if rank < full and not isinstance(lags, Missing):
+    lags, poor = entry(model, "excitation", "lags"), ""
+    if rank < full and lags is not None:
         weak = [key for key, part in model["excitation"]["inputs"].items() if part["rank"] < lags]
         poor = (
-            f" Too poor on its own: {_listed(weak)}."
+            f" Too poor on its own: {listed(weak)}."
             if weak
             else " Each is rich enough alone, but they move alike."
         )
@@ -317,7 +306,7 @@ def _effects(evidence: Evidence, question: Question) -> Reading:
     signed = f"{int(table['seen'].sum())} of {len(table['seen'])}"
     names = [signal.name for signal in evidence.machine.inputs]
     blind = [name for name in names if not table["seen"][table["input"] == name].any()]
-    words = {"signed": signed, "inputs": _listed(blind) if blind else ""}
+    words = {"signed": signed, "inputs": listed(blind) if blind else ""}
     return count_of(len(blind)), {**words, "text": f"{blind[0]}: sign unknown" if blind else signed}
 
 
@@ -325,13 +314,11 @@ def _stability(evidence: Evidence, question: Question) -> Reading:
     radius = need_figure(evidence.figures["identify_plant"], "largest_pole")
     pole = number(radius, 4 if abs(radius - 1) > 1e-4 else 6)
     refinement = evidence.params.get("identify_plant", {}).get("refinement")
-    case = "validated" if refinement == "validated" else "other"
-    return count_of(radius), {"pole": pole, "text": f"largest pole {pole}", "case": case}
-
-
-def _heaters(evidence: Evidence) -> list[str]:
-    """Inputs that are declared to heat."""
-    return [signal.name for signal in evidence.machine.inputs if signal.heats]
+    return count_of(radius), {
+        "pole": pole,
+        "text": f"largest pole {pole}",
+        "case": "validated" if refinement == "validated" else "other",
+    }
 
 
 def _gains(evidence: Evidence, question: Question) -> Reading:

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from pipeline.store import params
 from pipeline.verdict.digits import THIN
-from pipeline.verdict.evidence import Absent, Figures
+from pipeline.verdict.evidence import Absent, Evidence, Figures
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import OPEN, PASSED, UNDECIDED, Figure, Missing, Question, Rule, count_of
 
@@ -189,11 +189,15 @@ def judge(
         )
     case, text = words.get("case", ""), words.get("text", _text(figure.value, row.unit))
     rule = Rule(row.name, question, figure, text, allowed, row.place)
-    undecided = decides(question, figure, words) if decides and rule.state == UNDECIDED else ""
     fails = words.get("fails") or (row.fails if isinstance(row.fails, str) else row.fails[case])
     remedy = words.get("remedy") or (row.remedy if isinstance(row.remedy, str) else row.remedy[case])
-    limit = words.get("limit_words") or _text(question.limit, row.unit)
-    places = {"name": row.name, "value": text, **words, "limit": limit, "undecided": undecided}
+    places = {
+        "name": row.name,
+        "value": text,
+        **words,
+        "limit": words.get("limit_words") or _text(question.limit, row.unit),
+        "undecided": decides(question, figure, words) if decides and rule.state == UNDECIDED else "",
+    }
     sentence = row.passes if row.passes and rule.state == PASSED else fails
     try:
         return rule._replace(reason=sentence.format(**places), remedy=remedy.format(**places))
@@ -202,6 +206,29 @@ def judge(
             f"{PATH.name}: a sentence of the rule {row.name} has no place for {error}; it may use "
             f"{', '.join(f'{{{place}}}' for place in sorted(places))}"
         ) from None
+
+
+def ask(
+    loop: str,
+    key: str,
+    evidence: Evidence,
+    own: Callable[[Question], Reading] | None = None,
+    controller: str = "",
+    decides: Callable[[Question, Figure, Mapping[str, Any]], str] | None = None,
+    row: Row | None = None,
+) -> Rule:
+    """The rule `key` of a loop for a controller: its figure is that of the function `own`, else the one at
+    its path. `row` stands in the place of the one of rules.toml."""
+    row = row or rows(loop)[key]
+    question = row.question(key, row.limit(evidence.rules))
+
+    def read() -> Reading:
+        if own:
+            return own(question)
+        path = row.figure.format(controller=controller)
+        return at_path(evidence.figures, path, at_least=question.at_least), {}
+
+    return judge(row, question, read, decides)
 
 
 def _text(value: float, unit: str) -> str:

@@ -11,8 +11,19 @@ import pandas as pd
 from pipeline.setpoint.agents.criteria import BEYOND, harm_bar
 from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.verdict.digits import THIN, band, count, number, quantity
-from pipeline.verdict.evidence import Evidence, lookup
-from pipeline.verdict.rules import Reading, Row, at_path, judge, rows
+from pipeline.verdict.evidence import (
+    Absent,
+    Evidence,
+    entry,
+    gap_of,
+    instead,
+    known,
+    lookup,
+    need,
+    need_figure,
+    or_gap,
+)
+from pipeline.verdict.rules import Reading, ask, rows
 from pipeline.verdict.verdict import (
     CERTIFICATE,
     FAILED,
@@ -129,22 +140,20 @@ def within(case: Case) -> str:
     return text[:1].lower() + text[1:]
 
 
+@or_gap
 def board(evidence: Evidence, subject: str = "") -> Board | Missing:
     """Everybody who was judged; the default is the one of the choice, or the `subject` of a verdict."""
-    table, choice = evidence.tables["scoreboard"], evidence.tables["choice"]
-    if isinstance(table, Missing):
-        return table
+    table, said = need(evidence.tables["scoreboard"]), known(evidence.tables["choice"], {})
     if not len(table["controller"]):
-        return Missing("not measured", "the scoreboard is empty", "Run ./run dvc repro evaluate_setpoint")
+        remedy = "Run ./run dvc repro evaluate_setpoint"
+        raise Absent(Missing("not measured", "the scoreboard is empty", remedy))
     rows: list[Any] = list(pd.DataFrame(table).itertuples())
     cells = {(row.controller, (row.simulator, row.case)): _cell(row) for row in rows}
     kinds = {row.controller: row.kind for row in rows}
-    said = choice if isinstance(choice, Mapping) else {}
-    refused = said.get("refused")
-    refused = {name: str(why) for name, why in refused.items()} if isinstance(refused, Mapping) else {}
+    refused = {name: str(why) for name, why in (entry(said, "refused") or {}).items()}
     unranked = Board(list(kinds), kinds, list(dict.fromkeys(case for _, case in cells)), cells, "", refused)
     ranked = sorted(kinds, key=lambda name: (name not in refused, _rank(unranked, name)), reverse=True)
-    chosen = subject or str(said.get("name", ""))
+    chosen = subject or str(entry(said, "name") or "")
     return unranked._replace(names=ranked, default=chosen if chosen in kinds else "")
 
 
@@ -201,7 +210,7 @@ def worst(board: Board, name: str, what: str) -> tuple[Figure | Missing, Case | 
 
 
 def share_text(figure: Figure | Missing) -> str:
-    return figure.state if isinstance(figure, Missing) else quantity(figure.value, "%", 1)
+    return quantity(figure.value, "%", 1) if isinstance(figure, Figure) else figure.state
 
 
 # ---- the rules
@@ -219,23 +228,16 @@ def of_classifier(rule: Rule) -> bool:
 def rules(evidence: Evidence, board: Board | None) -> tuple[Pair, ...]:
     names = (board.learned(), board.baseline()) if board else ("", "")
     return tuple(
-        (_rule(evidence, board, key, row, names[0], 0), _rule(evidence, board, key, row, names[1], 1))
-        for key, row in rows(LOOP).items()
+        (_rule(evidence, board, key, names[0], 0), _rule(evidence, board, key, names[1], 1))
+        for key in rows(LOOP)
     )
 
 
-def _rule(evidence: Evidence, board: Board | None, key: str, row: Row, name: str, column: int) -> Rule:
-    question = row.question(key, row.limit(evidence.rules))
-
-    def read() -> Reading:
-        if key in CONTROL:
-            return CONTROL[key](evidence, board, name)
-        if key in SEEING:
-            return SEEING[key](evidence, column)
-        path = row.figure.format(controller=name)
-        return at_path(evidence.figures, path, at_least=question.at_least), {}
-
-    return judge(row, question, read, undecided)
+def _rule(evidence: Evidence, board: Board | None, key: str, name: str, column: int) -> Rule:
+    if control := CONTROL.get(key):
+        return ask(LOOP, key, evidence, lambda question: control(evidence, board, name), name, undecided)
+    own = (lambda question: SEEING[key](evidence, column)) if key in SEEING else None
+    return ask(LOOP, key, evidence, own, name, undecided)
 
 
 class Harm(NamedTuple):
@@ -282,7 +284,7 @@ def _share(what: str) -> Callable[[Evidence, Board | None, str], Reading]:
         if board is None:
             return Missing(OPEN, ""), {"reason": "Nothing was judged.", "remedy": ""}
         figure, case = worst(board, name, what)
-        if isinstance(figure, Missing) or case is None:
+        if case is None or not isinstance(figure, Figure):
             return figure, {"text": share_text(figure)}
         limit = float(getattr(evidence.rules, f"{what}_percent"))
         held, words = threshold(figure, board.cells[name, case].n_eff[what], limit, at_least=True)
@@ -308,8 +310,7 @@ def threshold(figure: Figure, n_eff: float, limit: float, *, at_least: bool) -> 
 
 def _segments(evidence: Evidence) -> float:
     """How many recorded segments the controllers were judged on."""
-    found = lookup(evidence.tables["choice"], "pair.segments")
-    return math.nan if isinstance(found, Missing) else float(found)
+    return float(known(lookup(evidence.tables["choice"], "pair.segments"), math.nan))
 
 
 def _harm(evidence: Evidence, board: Board | None, name: str) -> Reading:
@@ -323,7 +324,7 @@ def _harm(evidence: Evidence, board: Board | None, name: str) -> Reading:
     if board is None or not limits:
         return Missing(OPEN, ""), absent
     harm = harm_of(board, name, limits)
-    if isinstance(harm, Missing):
+    if not isinstance(harm, Harm):
         return Missing(OPEN, ""), absent | {"reason": harm.sentence()}
     idle = harm_of(board, DOES_NOTHING, limits)
     ends = sorted(set(limits.values()))
@@ -333,7 +334,7 @@ def _harm(evidence: Evidence, board: Board | None, name: str) -> Reading:
         "segments": _segments(evidence),
         "allowed": f"≤ {' or '.join(f'{end:g}' for end in ends)}{THIN}%",
         "case_text": case_text(harm.case, whole=True),
-        "idle": "" if isinstance(idle, Missing) else f" With doing nothing {share_text(idle.figure)} do.",
+        "idle": f" With doing nothing {share_text(idle.figure)} do." if isinstance(idle, Harm) else "",
     }
 
 
@@ -351,16 +352,15 @@ def share_in(row: Mapping[str, Any] | None) -> Figure | None:
     return Figure(value, low, high)
 
 
+@instead(lambda gap: _seen(gap))
 def _right_by_flow(evidence: Evidence, column: int) -> Reading:
     """Windows named rightly were every flow from 70 to 150 % as frequent; yardsticks are not judged so."""
     if column:
         return _seen(
             Missing("not applicable", "the yardsticks are judged on windows of all flows"), "not judged so"
         )
-    figure = lookup(evidence.figures["train_classifier"], "right_70_150")
-    if not isinstance(figure, Missing):
-        figure = share_in(figure) or Missing(OPEN, "no window lies between 70 and 150 % of flow")
-    return _seen(figure)
+    row = need_figure(evidence.figures["train_classifier"], "right_70_150")
+    return _seen(share_in(row) or Missing(OPEN, "no window lies between 70 and 150 % of flow"))
 
 
 def _accuracy(evidence: Evidence, column: int) -> Reading:
@@ -376,23 +376,20 @@ def _accuracy(evidence: Evidence, column: int) -> Reading:
     return _seen(known[best], f"{share_text(known[best])} {BRIEF[best]}")
 
 
+@or_gap
 def accuracy(metrics: Mapping | Missing, name: str) -> Figure | Missing:
     """In percent, with the interval where the stage gives one."""
-    value = lookup(metrics, f"{name}_accuracy")
-    if isinstance(value, Missing):
-        return value
-    ends = lookup(metrics, f"intervals_percent.{name}")
-    low, high = (100 * value, 100 * value) if isinstance(ends, Missing) else map(float, ends)
-    return Figure(100 * value, low, high)
+    percent = 100 * need_figure(metrics, f"{name}_accuracy")
+    low, high = known(lookup(metrics, f"intervals_percent.{name}"), (percent, percent))
+    return Figure(percent, float(low), float(high))
 
 
 def _calibration(*keys: str) -> Callable[[Evidence, int], Reading]:
     """The reading of the error of calibration: of the classifier, and without its calibration."""
 
+    @instead(lambda gap: (gap._replace(state=OPEN), {"reason": "It was not measured."}))
     def read(evidence: Evidence, column: int) -> Reading:
-        error = lookup(evidence.figures["train_classifier"], keys[column])
-        if isinstance(error, Missing):
-            return error._replace(state=OPEN), {"reason": "It was not measured."}
+        error = need_figure(evidence.figures["train_classifier"], keys[column])
         return count_of(error), {"text": number(error, 3)}
 
     return read
@@ -442,20 +439,18 @@ def verdict(evidence: Evidence) -> Verdict:
     scores, recorded = board(evidence), evidence.recorded("train_classifier")
     claim, words = CLAIM_RECORDED if recorded else CLAIM, words_for(recorded=recorded, quick=evidence.quick)
     if isinstance(scores, Missing) or not scores.default:
-        gap = scores if isinstance(scores, Missing) else evidence.tables["choice"]
+        gap = gap_of(scores) or gap_of(evidence.tables["choice"])
         return Verdict(
             loop=LOOP,
             state=OPEN,
             decision=words.undecided,
             lead="No controller was chosen.",
-            reason=gap.sentence()
-            if isinstance(gap, Missing)
-            else "The choice names a controller that was not judged.",
+            reason=gap.sentence() if gap else "The choice names a controller that was not judged.",
             remedy="",
             rule="",
             winner="",
             note=claim,
-            rules=rules(evidence, None if isinstance(scores, Missing) else scores),
+            rules=rules(evidence, known(scores, None)),
         )
     scores = _certified(evidence, scores)
     lines, refusal = rules(evidence, scores), evidence.refusal(LOOP, scores.default)
@@ -550,13 +545,12 @@ def named(board: Board, name: str) -> str:
     return f"the {board.kinds[name]}{'' if board.kinds[name] == BASELINE else ' controller'} “{name}”"
 
 
+@instead(lambda gap: PairSentence("Model-based against data-driven: not measured.", None))
 def pair_sentence(choice: Any) -> PairSentence:
     """ "the Bayes filter keeps 41 points more of its runs than the paper's agent", on the same windows and
     segments; or that more segments are needed to tell."""
-    head, pair = "Model-based against data-driven:", lookup(choice, "pair")
-    gap = lookup(pair, "difference")
-    if isinstance(gap, Missing):
-        return PairSentence(f"{head} not measured.", None)
+    head, pair = "Model-based against data-driven:", need_figure(choice, "pair")
+    gap = need_figure(pair, "difference")
     a, b, winner = str(pair["a"]), str(pair["b"]), pair.get("winner")
     same = f"on the same {pair['segments']:,} segments, {count(pair['cases'], 'case')}"
     if winner not in (a, b):
@@ -584,7 +578,7 @@ def _the(name: str) -> str:
 def summary(evidence: Evidence, board: Board) -> str:
     """The default's worst case."""
     mine, place = worst(board, board.default, "lasting")
-    if place is None or isinstance(mine, Missing):
+    if place is None or not isinstance(mine, Figure):
         return ""
     cell = board.cells[board.default, place]
     worth = f", worth {number(cell.n_eff['stay'], 0)} that share nothing," if "stay" in cell.n_eff else ""

@@ -7,7 +7,7 @@ from typing import Any
 
 from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading
 from pipeline.verdict.digits import number
-from pipeline.verdict.evidence import Figures, entry
+from pipeline.verdict.evidence import Figures, entry, gap_of, need, or_gap
 from pipeline.verdict.rules import at_path, rows
 from pipeline.verdict.verdict import OPEN, Figure, Missing, count_of
 
@@ -103,9 +103,7 @@ def _without(figures: Figures, name: str) -> Missing:
     compared = figures.get("evaluate_temperature")
     if reason := refused(figures).get(name):
         return Missing("failed", reason)
-    if isinstance(compared, Missing):
-        return compared
-    return Missing(OPEN, f"{heading(name)} is not among what the stage measured", REPEAT)
+    return gap_of(compared) or Missing(OPEN, f"{heading(name)} is not among what the stage measured", REPEAT)
 
 
 def unstable(figures: Any) -> tuple[int, int]:
@@ -213,13 +211,13 @@ def _no_plant(model: Any) -> Missing | None:
     return None
 
 
+@or_gap
 def _of(stage: Any, samples: Any, needed: Any) -> Figure | Missing:
-    if isinstance(stage, Missing):
-        return stage
+    need(stage)
     if samples is None or not needed:
         return Missing(OPEN, "the number of samples that are needed is not known")
     ratio, more = samples / needed, max(needed - samples, 0)
-    note = f"{number(samples, 0)} of {number(needed, 0)} samples" + (
-        f"; record {number(more, 0)} more" if more else ""
+    return count_of(ratio)._replace(
+        note=f"{number(samples, 0)} of {number(needed, 0)} samples"
+        + (f"; record {number(more, 0)} more" if more else "")
     )
-    return count_of(ratio)._replace(note=note)

@@ -225,23 +225,6 @@ class Verdict(NamedTuple):
         """What datasets/report/figures.json keeps of it."""
         return {name: getattr(self, name) for name in WRITTEN}
 
-    @classmethod
-    def read(cls, loop: str, fields: Mapping[str, Any]) -> "Verdict":
-        """What `metrics` wrote. Of a file that somebody edited, what is missing is empty, and open."""
-        text = {name: str(fields.get(name) or "") for name in WRITTEN}
-        verdict = cls(
-            loop, text["state"] or OPEN, text["decision"], text["lead"], text["reason"], "", "", None
-        )
-        return verdict._replace(
-            remedy=text["remedy"],
-            rule=text["rule"],
-            winner=text["winner"] or None,
-            subject=text["subject"],
-            rehearsal=bool(fields.get("rehearsal")),
-            answer=text["answer"],
-            short_answer=text["short_answer"],
-        )
-
 
 WRITTEN = (
     "state", "decision", "lead", "reason", "remedy", "rule", "winner", "subject", "rehearsal", "answer",
@@ -297,8 +280,9 @@ def _text(value: Any) -> Any:
 
 
 def _decode(fields: Mapping[str, Any]) -> Verdict:
-    rules = tuple(tuple(_rule(rule) for rule in line) for line in fields["rules"])
-    return Verdict(**{name: fields[name] for name in Verdict._fields})._replace(rules=rules)
+    return Verdict(**{name: fields[name] for name in Verdict._fields})._replace(
+        rules=tuple(tuple(_rule(rule) for rule in line) for line in fields["rules"])
+    )
 
 
 def _rule(fields: Mapping[str, Any]) -> Rule:

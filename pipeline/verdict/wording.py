@@ -37,6 +37,15 @@ def banded(question: Question, figure: Figure, places: int) -> str:
     return band(figure.low, figure.high, places, unit=question.unit)
 
 
+def limit_text(question: Question) -> str:
+    """ "≤ 0.5 °C", as it was declared: "10.000 %" reads as ten thousand where a point parts thousands; "" if
+    there is none."""
+    if math.isinf(question.limit):
+        return ""
+    sign = "≥" if question.at_least else "≤"
+    return f"{sign} {with_unit(question.limit, question.unit, declared(question.limit))}"
+
+
 def name_first(name: str) -> str:
     text = in_a_sentence(name) if name else "it"
     return f"{text[:1].upper()}{text[1:]}"
@@ -67,8 +76,7 @@ def words_of(question: Question, figure: Figure, name: str) -> dict[str, Any]:
     if question.key == "data" or not (math.isinf(figure.value) or value == OFF_THE_SCALE):
         return words
     key = f" in {question.key.replace('_', ' ')}" if value == OFF_THE_SCALE else ""
-    lost = value if value == INFINITE["settling"] else f"is {value}{key}"
-    return words | {"fails": LOST, "lost": lost}
+    return words | {"fails": LOST, "lost": value if value == INFINITE["settling"] else f"is {value}{key}"}
 
 
 def straddling(question: Question, figure: Figure, words: Mapping[str, Any]) -> str:

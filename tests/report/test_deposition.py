@@ -15,7 +15,7 @@ from pipeline.deposition.parts import extrusion, part_report
 from pipeline.deposition.settings import Printer
 from pipeline.deposition.tables import SIGNALS
 from pipeline.deposition.toolpath import gcode
-from pipeline.report.deposition import change
+from pipeline.report.deposition import card
 from pipeline.store import artifacts, params
 from pipeline.verdict import deposition as rules
 from pipeline.verdict.evidence import Evidence
@@ -377,9 +377,9 @@ def test_on_a_real_machine_that_is_not_judged_nothing_is_compared_and_no_line_is
                            params.load(ReportRules, "report"), simulated=False)  # fmt: skip
     then = {"metrics": {"compose_parts": {"square": {"A": {
         "chosen": "basis", "basis": {"rms_percent_of_on_off": 17.0}}}}}}  # fmt: skip
-    (move,) = change.moves(types.SimpleNamespace(accepted=then), [part])
+    (move,) = card.moves(types.SimpleNamespace(accepted=then), [part])
     assert not move.moved and move.text() == "not judged"
-    (known,) = change.moves(types.SimpleNamespace(accepted=then), [part._replace(simulated=True)])
+    (known,) = card.moves(types.SimpleNamespace(accepted=then), [part._replace(simulated=True)])
     assert known.text().startswith("+81")
 
 

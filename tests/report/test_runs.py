@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pipeline import cli
-from pipeline.report.runs import curves, figures
+from pipeline.report.runs import figures
 from pipeline.report.runs.page import Run, render_two
 from pipeline.store import artifacts, params
 from pipeline.verdict.settings import ReportRules
@@ -91,7 +91,7 @@ def test_a_figure_without_a_band_is_neither_better_nor_worse(accepted):
 def test_curves_of_both_runs_are_drawn_and_an_accepted_run_without_curves_says_so(accepted):
     kept = artifacts.read_json("reports/accepted.json")
     assert len(kept["curves"]) == 4 and all(
-        len(curve["x"]) <= curves.SAMPLES for curve in kept["curves"].values()
+        len(curve["x"]) <= figures.SAMPLES for curve in kept["curves"].values()
     )
     main()
     drawn = [
@@ -111,10 +111,10 @@ def test_a_long_curve_keeps_its_first_and_its_last_sample():
         "update": made.np.arange(1000),
         "reward": made.np.append(made.np.nan, made.np.arange(999) / 7),
     }
-    ((name, curve),) = curves._agent(table)
+    ((name, curve),) = figures._agent(table)
     assert (curve.x[0], curve.x[-1], curve.y[-1]) == (1.0, 999.0, 142.6)
-    assert len(curve.x) == curves.SAMPLES and name.startswith("Setpoint")
-    assert curves.restored(json.loads(curves.as_json({name: curve}))) == {name: curve}
+    assert len(curve.x) == figures.SAMPLES and name.startswith("Setpoint")
+    assert figures.restored(json.loads(figures.as_json({name: curve}))) == {name: curve}
 
 
 def test_without_an_accepted_run_the_page_shows_this_run_alone(project):

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.report.temperature.beside import best_sentence, deciding_sentence
-from pipeline.report.temperature.judgement import judgement
+from pipeline.report.temperature.judgement import best_sentence, deciding_sentence, judgement
 from pipeline.store import artifacts, params
 from pipeline.temperature.settings import Plant
 from pipeline.verdict.controllers import in_a_sentence

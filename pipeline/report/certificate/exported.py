@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from pipeline.report.shared.sources import LARGEST_COPY, Sources
 from pipeline.verdict.controllers import BY_NAME, in_a_sentence
 from pipeline.verdict.digits import count
-from pipeline.verdict.evidence import lookup
+from pipeline.verdict.evidence import gap_of, known, lookup, need, or_gap
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 
 STAGE, LOOPS = "export_controllers", ("temperature", "deposition", "setpoint")
@@ -33,19 +33,18 @@ class ExportedLine(NamedTuple):
     why: str
 
 
+@or_gap
 def lines(sources: Sources, verdict: Verdict) -> list[ExportedLine] | Missing:
     """One a loop, or why there are none. A certificate says no more than the temperature loop's `verdict` on
     page one: it may run where that is passed, for this controller."""
-    metrics = sources.metrics.get(STAGE) or Missing(OPEN, f"{STAGE} has not run")
-    if isinstance(metrics, Missing):
-        return metrics
+    metrics = need(sources.metrics.get(STAGE) or Missing(OPEN, f"{STAGE} has not run"))
     return [_line(loop, metrics, verdict) for loop in LOOPS]
 
 
 def _line(loop: str, metrics: Mapping[str, Any], verdict: Verdict) -> ExportedLine:
     fields = lookup(metrics, loop, what=f"{loop} loop")
-    if isinstance(fields, Missing):
-        return ExportedLine(loop, OPEN, NONE, "", "", "", "", "", fields.sentence())
+    if gap := gap_of(fields):
+        return ExportedLine(loop, OPEN, NONE, "", "", "", "", "", gap.sentence())
     shown, files = fields.get("certificate"), dict(fields.get("files") or {})
     first = next(iter(files), "")
     main = next((path for path in files if path.endswith("controller.json")), first)
@@ -83,5 +82,5 @@ def link(sources: Sources, line: ExportedLine) -> str:
 
 def copies(sources: Sources, lines: Sequence[ExportedLine] | Missing) -> dict[str, bytes]:
     """Name in reports/data -> bytes of each file to load that `link` leads to."""
-    found = {} if isinstance(lines, Missing) else {link(sources, line): line.file for line in lines}
+    found = {link(sources, line): line.file for line in known(lines, [])}
     return {place.removeprefix("data/"): Path(path).read_bytes() for place, path in found.items() if place}

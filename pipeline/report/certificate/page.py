@@ -8,38 +8,37 @@ import numpy as np
 
 from pipeline.report.certificate import exported
 from pipeline.report.shared import charts, page, words
-from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.controllers import BY_NAME, heading
 from pipeline.verdict.digits import number, with_unit
-from pipeline.verdict.evidence import lookup
+from pipeline.verdict.evidence import Absent, entry, gap_of, known, need, need_figure, or_nothing
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 
 WORDS = ("verdict", "margin_disk", "margin_delay", "spread", "step", "hash")
 MOST_BANDS = 40  # gains that are listed, those that are surest of all inputs first
-CIRCLE = np.linspace(0, 2 * np.pi, 181)
 
 
 def render(sources: Sources, verdict: Verdict) -> str:
     """The text of certificate.html; `verdict` is that of the temperature loop on page one."""
     lines = exported.lines(sources, verdict)
     shown = _certificate(sources, lines)
-    whole = not isinstance(shown, Missing)
+    whole = known(shown, None)
     return page.render(
         "certificate.html",
         here="certificate",
         sources=sources,
         title="Certificate",
         head=head(shown, lines),
-        missing_certificate=None if whole else shown,
-        rules=rule_rows(shown) if whole else [],
+        missing_certificate=gap_of(shown),
+        rules=rule_rows(whole) if whole else [],
         controllers=controllers(sources),
-        about=about(shown) if whole else [],
+        about=about(whole) if whole else [],
         poles=poles(sources, shown),
-        margins=margins(shown) if whole else [],
+        margins=margins(whole) if whole else [],
         judged_margins=judged_margins(sources),
-        bands=band_rows(shown) if whole else [],
-        lines=[] if isinstance(lines, Missing) else lines,
+        bands=band_rows(whole) if whole else [],
+        lines=known(lines, []),
         origin_of=page.origin(sources.source("certificate", "export_controllers")),
         differences=differences(sources),
         words=words.chosen(sources, WORDS),
@@ -51,9 +50,9 @@ def _certificate(
 ) -> Mapping[str, Any] | Missing:
     """The certificate, or why there is none: in the words of export_controllers if it ran."""
     shown = sources.tables.get("certificate") or Missing(OPEN, "export_controllers has not run")
-    if not isinstance(shown, Missing) or isinstance(lines, Missing):
+    why = next((line.why for line in known(lines, []) if line.loop == "temperature"), "")
+    if not gap_of(shown):
         return shown
-    why = next(line.why for line in lines if line.loop == "temperature")
     return Missing(OPEN, why) if why else shown
 
 
@@ -61,71 +60,33 @@ def head(
     shown: Mapping[str, Any] | Missing, lines: Sequence[exported.ExportedLine] | Missing
 ) -> dict[str, Any]:
     """Passed or refused, and the first rule that failed."""
-    if isinstance(lines, Missing):
-        return {
-            "state": "open",
-            "decision": "No certificate.",
-            "lead": "",
-            "reason": lines.sentence(),
-            "remedy": "",
-            "claim": "",
-            "changed": "",
-            "rules": (),
-            "heads": (),
-        }
-    mine = next(line for line in lines if line.loop == "temperature")
+    said: dict[str, Any] = {"state": "open", "decision": "No certificate.", "reason": "", "lead": ""}
+    said |= {"remedy": "", "claim": "", "changed": "", "rules": (), "heads": ()}
+    if gap := gap_of(lines):
+        return said | {"reason": gap.sentence()}
+    mine = next(line for line in known(lines, []) if line.loop == "temperature")
     state = {PASSED: "passed", FAILED: "failed"}.get(mine.state, "open")
-    if isinstance(shown, Missing) or mine.state == OPEN:
-        return {
-            "state": state,
-            "decision": mine.word,
-            "lead": "",
-            "reason": mine.why,
-            "remedy": "",
-            "claim": "",
-            "changed": "",
-            "rules": (),
-            "heads": (),
-        }
+    said |= {"state": state, "decision": mine.word, "reason": mine.why}
+    if gap_of(shown) or mine.state == OPEN:
+        return said
     if mine.state == FAILED:
-        rule = str(shown.get("first_failed") or "").replace("_", " ")
-        return {
-            "state": state,
-            "decision": mine.word,
-            "lead": f"First failed rule: {rule}.",
-            "reason": mine.why,
-            "remedy": "Nothing of this loop is exported.",
-            "claim": "",
-            "changed": "",
-            "rules": (),
-            "heads": (),
-        }
+        rule = str(entry(shown, "first_failed") or "").replace("_", " ")
+        return said | {"lead": f"First failed rule: {rule}.", "remedy": "Nothing of this loop is exported."}
     limits = "It holds for this plant, these units and this sample time, and nothing else."
-    if shown.get("evidence") == "simulated":
+    if entry(shown, "evidence") == "simulated":
         limits += " The plant is simulated: not for a real machine."
-    return {
-        "state": state,
-        "decision": f"{mine.word} {mine.name[:1].upper()}{mine.name[1:]}.",
-        "lead": "",
-        "reason": limits,
-        "remedy": "",
-        "claim": "",
-        "changed": "",
-        "rules": (),
-        "heads": (),
-    }
+    return said | {"decision": f"{mine.word} {mine.name[:1].upper()}{mine.name[1:]}.", "reason": limits}
 
 
 def rule_rows(shown: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The rules in the order in which they were asked."""
     rows = []
     for rule in shown["rules"]:
-        state = OPEN if not rule.get("asked", True) else PASSED if rule["passed"] else FAILED
         found, limit = (_figure(rule.get(key), rule.get("unit") or "") for key in ("found", "limit"))
         rows.append(
             {
                 "name": rule["name"].replace("_", " "),
-                "state": state,
+                "state": OPEN if not rule.get("asked", True) else PASSED if rule["passed"] else FAILED,
                 "found": found,
                 "limit": f"{_side(rule)}{limit}",
                 "sentence": rule["sentence"],
@@ -186,15 +147,12 @@ def _signal(one: Mapping[str, Any]) -> str:
     return f"{one['name']} in {one['unit']}, {low} to {high}"
 
 
+@as_picture("poles", "Poles of the closed loop")
 def poles(sources: Sources, shown: Mapping[str, Any] | Missing) -> Picture:
     """Closed-loop poles: of the model, of its spread and of what the record leaves open."""
-    title = "Poles of the closed loop"
-    if isinstance(shown, Missing):
-        return placeholder("poles", title, shown)
+    shown = need(shown)
     if not shown["poles"]:
-        return placeholder(
-            "poles", title, Missing(OPEN, "An earlier rule refused, so that none was computed")
-        )
+        raise Absent(Missing(OPEN, "An earlier rule refused, so that none was computed"))
     largest = max(one["radius"] for one in shown["poles"])
     columns = [
         PictureColumn(name, small, "", [_circle(shown["poles"], near=near, largest=largest)])
@@ -207,7 +165,7 @@ def poles(sources: Sources, shown: Mapping[str, Any] | Missing) -> Picture:
     text = f"On {plants} plants the largest pole is of size {number(largest, 4)}: "
     text += "stable." if largest < 1 else "not stable."
     caption = "Crosses: the identified model. Dots: plants of its spread, and of what the record leaves open."
-    return Picture("poles", title, text, columns, caption, page.origin(sources.source("certificate")))
+    return Picture(text, columns, caption, page.origin(sources.source("certificate")))
 
 
 def _circle(loops: Sequence[Mapping[str, Any]], *, near: bool, largest: float):
@@ -215,22 +173,17 @@ def _circle(loops: Sequence[Mapping[str, Any]], *, near: bool, largest: float):
     frame = charts.Frame(
         charts.linear(low, high, ticks=3), charts.linear(-up, up, ticks=3), width=270, height=256, above=6
     )
-    edge = np.cos(CIRCLE), np.sin(CIRCLE)
-    layers = [charts.line(frame, *_inside(frame, *edge), "lim line thin", most=len(CIRCLE))]
+    layers = [charts.line(frame, *charts.inside(frame, *charts.CIRCLE), "lim line thin", most=181)]
     for model in (False, True):
         points = [pair for one in loops if (one["of"] == "model") == model for pair in one["poles"]]
         if points:
-            real, imag = _inside(frame, *np.array(points, float).T)
+            real, imag = charts.inside(frame, *np.array(points, float).T)
             layers.append(
                 charts.crosses(frame, real, imag) if model else charts.dots(frame, real, imag, "try", 1.7)
             )
-    alt = f"{len(loops)} closed loops, the largest pole of size {number(largest, 4)}"
-    return charts.panel(frame, layers, alt=alt)
-
-
-def _inside(frame: charts.Frame, real: np.ndarray, imag: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    inside = (real >= frame.x.low) & (real <= frame.x.high) & (imag >= frame.y.low) & (imag <= frame.y.high)
-    return real[inside], imag[inside]
+    return charts.panel(
+        frame, layers, alt=f"{len(loops)} closed loops, the largest pole of size {number(largest, 4)}"
+    )
 
 
 def margins(shown: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -248,15 +201,14 @@ def margins(shown: Mapping[str, Any]) -> list[tuple[str, ...]]:
     return rows
 
 
+@or_nothing
 def judged_margins(sources: Sources) -> str:
     """The same margins on the plants that page one judges on, which the record did not choose; "" where they
     were not judged."""
-    name = lookup(sources.metrics.get(exported.STAGE), "temperature.contestant")
+    name = need_figure(sources.metrics.get(exported.STAGE), "temperature.contestant")
     judged = sources.metrics.get("evaluate_temperature")
-    plants = lookup(judged, "plants")
-    ends = [lookup(judged, f"contestants.{name}.margins.{key}") for key in ("disk", "delay_s")]
-    if any(isinstance(one, Missing) for one in (name, plants, *ends)):
-        return ""
+    plants = need_figure(judged, "plants")
+    ends = [need_figure(judged, f"contestants.{name}.margins.{key}") for key in ("disk", "delay_s")]
     # null is a margin without end
     disk, delay = (
         ["unlimited" if one.get(of) is None else _figure(one[of], unit) for of in ("q10", "worst")]

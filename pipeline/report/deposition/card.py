@@ -2,39 +2,42 @@
 which the composer in use fares worst."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
-from pipeline.report.deposition.marks import KIND, MARK, real
-from pipeline.report.deposition.parts import draw_flows
+from pipeline.report.deposition.parts import KIND, MARK, draw_flows, lines_of, real
 from pipeline.report.shared import page
 from pipeline.report.shared.card import (
     PICTURE,
     Card,
-    CardCell,
-    CardRow,
-    CardStep,
     Deciding,
-    Entrant,
     best_of,
+    cell,
+    entrant,
     in_order,
     of_verdict,
+    or_no_figures,
+    step,
 )
+from pipeline.report.shared.difference import Move
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.deposition import (
     BASELINE,
     COMPOSERS,
     FIRST_TRIALS,
     NAMES,
+    NOT_JUDGED,
     OURS,
+    SAME,
     Structure,
     data_driven,
     structures,
     worst,
 )
 from pipeline.verdict.digits import THIN, band, count, decimals, number
-from pipeline.verdict.evidence import Table
-from pipeline.verdict.verdict import PASSED, Missing, Verdict
+from pipeline.verdict.evidence import Table, known, lookup, need, or_gap, or_nothing
+from pipeline.verdict.verdict import PASSED, Figure, Missing, Question, Verdict, count_of
 
 MOVES = "Plunger command to flow at the nozzle"
 # how long a stretch of a part is drawn, s
@@ -44,35 +47,31 @@ Read = Callable[[Structure, str], float | None]
 
 def card(sources: Sources, verdict: Verdict) -> Card:
     """Flow error, line volume and what learning the part itself would gain, of three composers."""
-    parts = structures(sources.evidence)
-    step = _step(sources, verdict)
-    if isinstance(parts, Missing):
-        return of_verdict(
-            verdict, MOVES, step, entrants=[], rows=[], basis="", cost="", picture=parts, sources=[],
-            missing=parts.sentence(),
-        )  # fmt: skip
+    return of_verdict(verdict, MOVES, _step(sources, verdict), **_figures(sources, verdict))
+
+
+@or_no_figures
+def _figures(sources: Sources, verdict: Verdict) -> dict[str, Any]:
+    parts = need(structures(sources.evidence))
     asked, names = sources.declared.rules, shown(verdict.winner or "", parts)
-    known = [part for part in parts if part.known()]
+    streams = [part for part in parts if part.known()]
     kinds = {name: KIND[name] for name in names}
-    return of_verdict(
-        verdict,
-        MOVES,
-        step,
-        entrants=[
+    return {
+        "entrants": [
             # "Library", by its better rule
-            Entrant(MARK[name], "Library" if KIND[name] == "data-driven" else NAMES[name], note)
+            entrant(MARK[name], "Library" if KIND[name] == "data-driven" else NAMES[name], note)
             for name, note in in_order(kinds).items()
         ],
-        rows=[
-            _row("Flow error", known, names, _error, asked.flow_error_percent, "≤", "%"),
-            _row("Line volume", known, names, _volume, asked.line_volume_percent, "±", "%"),
-            _row("Above learning it", known, names, _above, asked.above_whole_points, "≤", "pts"),
+        "rows": [
+            _row("Flow error", streams, names, Structure.error, asked.flow_error_percent, "≤", "%"),
+            _row("Line volume", streams, names, Structure.worst_line, asked.line_volume_percent, "±", "%"),
+            _row("Above learning it", streams, names, _above, asked.above_whole_points, "≤", "pts"),
         ],
-        basis=f"Worst of {count(len(known), 'stream')}; small: range",
-        cost=_cost(sources),
-        picture=deciding(sources, verdict),
-        sources=sources.source("scores"),
-    )
+        "basis": f"Worst of {count(len(streams), 'stream')}; small: range",
+        "cost": _cost(sources),
+        "picture": deciding(sources, verdict),
+        "sources": sources.source("scores"),
+    }
 
 
 def shown(winner: str, parts: Sequence[Structure]) -> list[str]:
@@ -88,10 +87,11 @@ def shown(winner: str, parts: Sequence[Structure]) -> list[str]:
     return list((of_kind | ({KIND[winner]: winner} if winner in KIND else {})).values())
 
 
+@or_nothing
 def _cost(sources: Sources) -> str:
     """Prints that were learned from."""
-    table = sources.tables["trials"]
-    if isinstance(table, Missing) or not len(table["trial"]):
+    table = need(sources.tables["trials"])
+    if not len(table["trial"]):
         return ""
     law = "model_inverse" if (table["law"] == "model_inverse").any() else "pixels"
     mine = table["law"] == law
@@ -104,14 +104,6 @@ def _cost(sources: Sources) -> str:
 # ---- the figures
 
 
-def _error(part: Structure, name: str) -> float | None:
-    return part.error(name)
-
-
-def _volume(part: Structure, name: str) -> float | None:
-    return part.worst_line(name)
-
-
 def _above(part: Structure, name: str) -> float | None:
     """Points above what learned this very part; None where nothing did."""
     both = name in part.scores and "ilc" in part.scores
@@ -121,48 +113,50 @@ def _above(part: Structure, name: str) -> float | None:
 def _row(
     title: str, parts: Sequence[Structure], names: Sequence[str], read: Read, limit: float, sign: str,
     unit: str,
-) -> CardRow:  # fmt: skip
+) -> dict[str, Any]:  # fmt: skip
     """The largest figure of each composer, the range over all streams beside it."""
     each = {name: [value for part in parts if (value := read(part, name)) is not None] for name in names}
     most = [max(values) if values else None for values in each.values()]
     best = best_of(most, at_least=False)
-    cells = [
-        _cell(values, unit, best=max(values, default=None) == best is not None, limit=limit)
-        for values in each.values()
-    ]
-    return CardRow(title, f"{sign}{'' if sign == '±' else ' '}{limit:g}{THIN}{unit}", cells)
+    limit_text = f"{sign}{'' if sign == '±' else ' '}{limit:g}{THIN}{unit}"
+    return {
+        "title": title,
+        "limit": limit_text,
+        "cells": [
+            _cell(values, unit, best=max(values, default=None) == best is not None, limit=limit)
+            for values in each.values()
+        ],
+    }
 
 
-def _cell(values: Sequence[float], unit: str, *, best: bool, limit: float) -> CardCell:
+def _cell(values: Sequence[float], unit: str, *, best: bool, limit: float) -> dict[str, Any]:
     if not values:
-        return CardCell("not measured")
+        return cell("not measured")
     low, high = min(values), max(values)
     places = min(decimals(low, high, value=high), 1)
-    return CardCell(f"{number(high, places)}{THIN}{unit}", band(low, high, places), best, bad=high > limit)
+    text = f"{number(high, places)}{THIN}{unit}"
+    return cell(text, band(low, high, places), best=best, bad=high > limit)
 
 
-def _step(sources: Sources, verdict: Verdict) -> CardStep:
+def _step(sources: Sources, verdict: Verdict) -> dict[str, str]:
     if verdict.remedy == FIRST_TRIALS:
-        return CardStep(verdict.remedy, "./run dvc repro")
+        return step(verdict.remedy, "./run dvc repro")
     if not verdict.winner and not verdict.remedy:
-        return CardStep("Run the stages of this loop.", "./run dvc repro compose_parts")
+        return step("Run the stages of this loop.", "./run dvc repro compose_parts")
     if verdict.state != PASSED and verdict.remedy:
-        return CardStep(f"{verdict.remedy.rstrip('.')}; then run it again.", "./run dvc repro")
+        return step(f"{verdict.remedy.rstrip('.')}; then run it again.", "./run dvc repro")
     if real(sources):
-        return CardStep("Compose the commands of a part.", "./run beadline compose PART.gcode")
-    return CardStep("Compose a part of your own.", "./run beadline compose PART.gcode --verify")
+        return step("Compose the commands of a part.", "./run beadline compose PART.gcode")
+    return step("Compose a part of your own.", "./run beadline compose PART.gcode --verify")
 
 
 # ---- the part that decides
 
 
+@or_gap
 def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     """Six seconds of the part on which the composer in use fares worst, about its largest error."""
-    parts, table = structures(sources.evidence), sources.tables["signals"]
-    if isinstance(parts, Missing):
-        return parts
-    if isinstance(table, Missing):
-        return table
+    parts, table = need(structures(sources.evidence)), need(sources.tables["signals"])
     names = shown(verdict.winner or "", parts)
     found = worst(parts, names[0])
     rows = [] if found is None else _stretch(table, found[1], names[0])
@@ -175,12 +169,12 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     finding = (
         f"{part.part}, material {part.material}, about the largest error; dashed: wanted flow. {listed}."
     )
-    seen = [f"{name}_mm3_per_s" for name in ("wanted", *drawn)]
+
     return Deciding(
         finding,
         draw_flows(stretch, drawn, finding, PICTURE),
         "",
-        page.in_viewer("signals", part=[part.part], material=[part.material], y=seen),
+        page.in_viewer("signals", part=[part.part], material=[part.material], y=lines_of(drawn)),
     )
 
 
@@ -194,3 +188,48 @@ def _stretch(table: Table, part: Structure, name: str) -> np.ndarray:
     middle = time[int(np.nanargmax(off))]
     start = min(max(middle - STRETCH_S / 2, time.min()), max(time.max() - STRETCH_S, time.min()))
     return mine[(time >= start) & (time <= start + STRETCH_S)]
+
+
+def moves(sources: Sources, parts: Sequence[Structure]) -> list[Move]:
+    """Of every structure and material the flow error of the composer in use. These errors have no bands: one
+    simulated print each, the same at every run; so noise is what the choice between composers calls equal.
+    """
+    return [_move(sources, part) for part in parts] if known(sources.accepted, None) else []
+
+
+def _move(sources: Sources, structure: Structure) -> Move:
+    question = Question(
+        0,
+        "flow_error_percent",
+        f"Flow error, {structure.part}, {structure.material}",
+        "%",
+        structure.asked.flow_error_percent,
+        False,
+        "",
+    )
+    score, before = structure.known().get(structure.chosen), _accepted(sources, structure)
+    if score is None:
+        why = NOT_JUDGED if structure.unknown() else "not measured"
+        return Move(question, before, Missing("not measured", "nothing to compare"), False, why)
+    now = count_of(score.error)
+    if before is None:
+        return Move(question, None, now, False, "new")
+    if before.value == now.value:
+        return Move(question, before, now, False, "unchanged")
+    if abs(now.value - before.value) <= SAME:
+        return Move(question, before, now, False, "within noise")
+    return Move(question, before, now, True, "better" if now.value < before.value else "worse")
+
+
+def _accepted(sources: Sources, structure: Structure) -> Figure | None:
+    """The error of the composer that was in use then, which may be another one."""
+    parts = known(lookup(sources.accepted, "metrics.compose_parts"), {})
+    then = parts.get(structure.part, {}).get(structure.material, {})
+    score = then.get(then.get("chosen"))
+    return count_of(float(score["rms_percent_of_on_off"])) if score else None
+
+
+def sentence(moves: Sequence[Move]) -> str:
+    """ "Deposition: 1 of 4 flow errors moved." """
+    changed = sum(move.moved for move in moves)
+    return f"Deposition: {changed} of {len(moves)} flow errors moved." if moves else ""

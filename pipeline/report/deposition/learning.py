@@ -2,19 +2,19 @@
 and after, what the camera saw and what was measured from it."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.deposition.marks import real
+from pipeline.report.deposition.parts import real
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
 from pipeline.report.shared.sources import Sources, first_routine
 from pipeline.verdict.digits import THIN, count, number, percent, short
-from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.evidence import Absent, Table, entry, known, lookup, need
 from pipeline.verdict.verdict import Missing
 
 # law -> head, what it is, class of its line; the order of every row of panels
@@ -56,18 +56,13 @@ def _trials(table: Table, material: str, law: str) -> Table:
     return {name: values[rows] for name, values in table.items()}
 
 
-def _columns(laws: list[str], draw: Callable[[str, int], list[Markup]]) -> list[PictureColumn]:
-    return [PictureColumn(*LAWS[law][:2], LAWS[law][3], draw(law, i)) for i, law in enumerate(laws)]
-
-
 # ---- error against trial
 
 
+@as_picture("learning-error", "Error after each trial")
 def errors(sources: Sources) -> Picture:
     """Both errors after every update, as share of trial 0's."""
-    table, title = first_routine(sources.tables["trials"]), "Error after each trial"
-    if isinstance(table, Missing):
-        return placeholder("learning-error", title, table)
+    table = need(first_routine(sources.tables["trials"]))
     materials, laws, machine = _materials(table), _laws(table), real(sources)
     last = max(int(table["trial"].max()), 1)
     curves = {law: {name: _trials(table, name, law) for name in materials} for law in laws}
@@ -92,7 +87,7 @@ def errors(sources: Sources) -> Picture:
             if material in curves[law]
         ]
 
-    shown = _columns(laws, draw)
+    shown = [PictureColumn(*LAWS[law][:2], LAWS[law][3], draw(law, i)) for i, law in enumerate(laws)]
     text = "; ".join(
         f"{LAWS[law][0]} ends at {', '.join(_ends(sources, law, of_law))}"
         for law, of_law in curves.items()
@@ -105,8 +100,6 @@ def errors(sources: Sources) -> Picture:
         "noise that does not repeat counts in it, and cannot be learned away."
     )
     return Picture(
-        "learning-error",
-        title,
         f"{text}.{_changes(sources, curves)}",
         shown,
         f"{floor} In % of trial 0’s, log scale, against the trial; the lines at 20 and 10 are the guides. "
@@ -117,8 +110,7 @@ def errors(sources: Sources) -> Picture:
 
 def _restarts(sources: Sources, law: str, material: str) -> list[int]:
     """The trials at which a machine was found changed on the shown routine; none in metrics of before."""
-    metrics = sources.metrics["train_ilc"]
-    of_law = metrics.get(material, {}).get(law, {}) if isinstance(metrics, dict) else {}
+    of_law = known(sources.metrics["train_ilc"], {}).get(material, {}).get(law, {})
     return [int(trial) for trial in of_law.get("restarts", [])]
 
 
@@ -194,18 +186,15 @@ def _error_panel(
 # ---- commands
 
 
+@as_picture("commands", "What the plunger is asked for")
 def commands(sources: Sources) -> Picture:
     """What the plunger is asked for: first, second and last trial."""
-    table, title = sources.tables["lessons"], "What the plunger is asked for"
-    if isinstance(table, Missing):
-        return placeholder("commands", title, table)
+    table = need(sources.tables["lessons"])
     materials = _materials(table)
     there = set(table["law"].tolist())
     law = next((name for name in ("model_inverse", "pixels") if name in there), None)
     if law is None:
-        return placeholder(
-            "commands", title, Missing("not measured", "no trial of the model inversion is there")
-        )
+        raise Absent(Missing("not measured", "no trial of the model inversion is there"))
     last = int(_trials(table, materials[0], law)["trial"].max(initial=0))
     peaks: list[str] = []
 
@@ -231,8 +220,6 @@ def commands(sources: Sources) -> Picture:
         for i, trial in enumerate(dict.fromkeys((0, min(1, last), last)))
     ]
     return Picture(
-        "commands",
-        title,
         f"At the end the command peaks at {', '.join(peaks)} the steady one: a push at every start, "
         "a pull at every stop. A drive that gives less needs longer ramps.",
         shown,
@@ -283,57 +270,40 @@ def _pause(trial: Table) -> tuple[float, float]:
     return float(trial["time_s"][on[gaps[0]]]), float(trial["time_s"][on[gaps[0] + 1]])
 
 
-class Story(NamedTuple):
-    """One column of the corner: its head, what it is, mark and class, the law, and whether its last trial is
-    drawn or its first."""
-
-    head: str
-    small: str
-    mark: str
-    css: str
-    law: str
-    after: bool
-
-
+@as_picture("corner", "Flow around the corner, before and after learning")
 def corner(sources: Sources) -> Picture:
     """Wanted and true flow around the pause, before and after."""
-    table, title = sources.tables["lessons"], "Flow around the corner, before and after learning"
-    if isinstance(table, Missing):
-        return placeholder("corner", title, table)
+    table = need(sources.tables["lessons"])
     materials, laws = _materials(table), _laws(table)
     kind = "measured_mm3_per_s" if real(sources) else "true_mm3_per_s"
-    stories = [Story("On\u2011off control", "before learning: trial 0", "baseline", "bl", laws[-1], False)]
-    stories += [Story(*LAWS[law][:2], LAWS[law][3], LAWS[law][2], law, True) for law in laws]
-    # the worse material's error, in % of a full line's flow
-    errors: dict[tuple[str, bool], float] = {}
+    # the worse material's error, in % of a full line's flow: of on-off control, and after learning by a law
+    errors: dict[str, float] = {}
 
-    def draw(story: Story, column: int) -> list[Markup]:
+    def draw(law: str, column: int) -> list[Markup]:
         panels = []
         for i, material in enumerate(materials):
-            trials = _trials(table, material, story.law)["trial"]
+            trials = _trials(table, material, law or laws[-1])["trial"]
             if not len(trials):
                 continue
-            mine = _trial(table, material, story.law, int(trials.max()) if story.after else 0)
+            mine = _trial(table, material, law or laws[-1], int(trials.max()) if law else 0)
             error, panel = _corner_panel(
-                mine, mine[kind], story, material, column == i == 0, i == len(materials) - 1
+                mine, mine[kind], law, material, column == i == 0, i == len(materials) - 1
             )
-            key = (story.law, story.after)
-            errors[key] = max(errors.get(key, 0.0), error)
+            errors[law] = max(errors.get(law, 0.0), error)
             panels.append(panel)
         return panels
 
     shown = [
-        PictureColumn(story.head, story.small, story.mark, draw(story, i)) for i, story in enumerate(stories)
+        PictureColumn("On\u2011off control", "before learning: trial 0", "baseline", draw("", 0)),
+        *(PictureColumn(*LAWS[law][:2], LAWS[law][3], draw(law, i)) for i, law in enumerate(laws, 1)),
     ]
     after = [
-        f"{LAWS[law][0][:1].lower()}{LAWS[law][0][1:]} {percent(errors[law, True], 2)}"
+        f"{LAWS[law][0][:1].lower()}{LAWS[law][0][1:]} {percent(errors[law], 2)}"
         for law in laws
-        if (law, True) in errors
+        if law in errors
     ]
-    before = errors.get((laws[-1], False))
+    before = errors.get("")
     return Picture(
-        "corner",
-        title,
         f"Through the corner on\u2011off control misses the wanted flow by {percent(before or 0.0, 2)} of a "
         f"full line; after the last trial: {', '.join(after)}, the worse material each.",
         shown,
@@ -341,7 +311,7 @@ def corner(sources: Sources) -> Picture:
         "began, in s; dashed: wanted.",
         page.origin(
             sources.source("lessons"),
-            material=materials,
+            material=materials[:1],
             routine=_routines(table),
             law=laws,
             trial=sorted(
@@ -353,9 +323,10 @@ def corner(sources: Sources) -> Picture:
 
 
 def _corner_panel(
-    mine: Table, flow: np.ndarray, story: Story, material: str, titled: bool, bottom: bool
+    mine: Table, flow: np.ndarray, law: str, material: str, titled: bool, bottom: bool
 ) -> tuple[float, Markup]:
-    """r.m.s. error in % of a full line's flow around the pause, and the flow drawn beside the wanted one."""
+    """r.m.s. error in % of a full line's flow around the pause, and the flow drawn beside the wanted one,
+    after learning by a law; before it if there is none."""
     begin, end = _pause(mine)
     near = (mine["time_s"] >= begin - 1.0) & (mine["time_s"] <= end + 1.5)
     t, flow, wanted = mine["time_s"][near] - begin, flow[near], mine["wanted_mm3_per_s"][near]
@@ -375,13 +346,13 @@ def _corner_panel(
         charts.line(frame, t, flow),
         charts.label(frame, frame.x.high, top, text, anchor="end", dy=8),
     ]
-    when = "After" if story.after else "Before"
+    when = f"After learning, {LAWS[law][0]}" if law else "Before learning, on-off control"
     panel = charts.panel(
         frame,
         layers,
-        alt=f"{when} learning, {LAWS[story.law][0] if story.after else 'on-off control'}, material "
-        f"{material}: the flow misses the wanted one by {percent(error, 2)} of a full line, r.m.s.",
-        css=story.css,
+        alt=f"{when}, material {material}: the flow misses the wanted one by {percent(error, 2)} of a full "
+        "line, r.m.s.",
+        css=LAWS[law][2] if law else "bl",
         title="mm³/s" if titled else "",
         x_ticks=bottom,
         units=("s", "mm³/s"),
@@ -392,19 +363,14 @@ def _corner_panel(
 # ---- what the camera saw
 
 
+@as_table()
 def frames(sources: Sources) -> dict[str, Any]:
     """Frames with the measured edges drawn in, and those that were rejected with the reason."""
-    pictures = sources.tables["frames"]
-    if isinstance(pictures, Missing):
-        return {"missing": pictures}
+    pictures = need(sources.tables["frames"])
     # the corner tells most, then what was rejected
     order = {"start": 0, "steady line": 1, "corner": 2, "rejected": 3}
     rows = sorted(pictures, key=lambda row: (row["material"], row["trial"], order.get(row["place"], 9)))
-    return {
-        "missing": None,
-        "shown": [_frame(row) for row in rows],
-        "origin": page.origin(sources.source("frames")),
-    }
+    return {"shown": [_frame(row) for row in rows], "origin": page.origin(sources.source("frames"))}
 
 
 def _frame(row: dict[str, Any]) -> dict[str, Any]:
@@ -425,20 +391,12 @@ def _frame(row: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+@as_picture("told", "The flow that the pictures told")
 def measured(sources: Sources) -> Picture:
     """The flow measured from pictures, with its band, against the true one."""
-    table, filmed, title = (
-        sources.tables["lessons"],
-        first_routine(sources.tables["filmed"]),
-        "The flow that the pictures told",
-    )
-    for missing in (table, filmed):
-        if isinstance(missing, Missing):
-            return placeholder("told", title, missing)
+    table, filmed = need(sources.tables["lessons"]), need(first_routine(sources.tables["filmed"]))
     if "pixels" not in _laws(table):
-        return placeholder(
-            "told", title, Missing("not measured", "no trial was filmed", "Run ./run dvc repro train_ilc")
-        )
+        raise Absent(Missing("not measured", "no trial was filmed", "Run ./run dvc repro train_ilc"))
     materials, machine = _materials(table), real(sources)
 
     def draw(material: str, column: int) -> list[Markup]:
@@ -469,8 +427,6 @@ def measured(sources: Sources) -> Picture:
         "trial, too; the true flow here is without it"
     )
     return Picture(
-        "told",
-        title,
         _flow_error(sources),
         shown,
         f"Measured flow in mm³/s against time in s{below}. "
@@ -489,11 +445,9 @@ def _flow_error(sources: Sources) -> str:
     """How far the measured flow is off the true one, by material, in a sentence."""
     figures = [
         f"{name} {percent(float(in_all), 2)}, around the corner {percent(float(near), 2)}"
-        for name, laws in (
-            sources.metrics["train_ilc"] if isinstance(sources.metrics["train_ilc"], dict) else {}
-        ).items()
-        if not isinstance(in_all := lookup(laws, "pixels.flow_error_percent"), Missing)
-        and not isinstance(near := lookup(laws, "pixels.flow_error_corner_percent"), Missing)
+        for name, laws in known(sources.metrics["train_ilc"], {}).items()
+        if (in_all := entry(laws, "pixels", "flow_error_percent")) is not None
+        and (near := entry(laws, "pixels", "flow_error_corner_percent")) is not None
     ]
     return (
         f"Over all trials the measured flow is off by, r.m.s. of a full line’s: {'; '.join(figures)}. "
@@ -564,28 +518,10 @@ def _measured_panels(mine: Table, wide: float, name: str, machine: bool, *, titl
     ]
 
 
-class Filmed(NamedTuple):
-    """What the camera read of one material, in words."""
-
-    material: str
-    trials: str
-    frames: str
-    rejected: str
-    why: str
-    deviation: str
-    observable: str
-    outliers: str
-    calibration: str
-    latency: str
-    untold: bool
-    delay: str
-
-
+@as_table(untold="")
 def camera(sources: Sources) -> dict[str, Any]:
     """By material: frames read and rejected, uncertainty, and what the calibration left."""
-    filmed, models = sources.tables["filmed"], sources.tables["models"]
-    if isinstance(filmed, Missing):
-        return {"missing": filmed, "untold": ""}
+    filmed, models = need(sources.tables["filmed"]), sources.tables["models"]
     by_material = pd.DataFrame(filmed).groupby("material", sort=False).agg(
         trials=("trial", "size"),
         frames=("frames", "sum"),
@@ -596,33 +532,32 @@ def camera(sources: Sources) -> dict[str, Any]:
         outliers=("outliers", "sum"),
     )  # fmt: skip
     rows = [_filmed(row, models, sources) for row in by_material.itertuples()]
-    return {"missing": None, "rows": rows, "untold": ", ".join(row.material for row in rows if row.untold)}
+    return {"rows": rows, "untold": ", ".join(row["material"] for row in rows if row["untold"])}
 
 
-def _filmed(row: Any, models: dict[str, Any] | Missing, sources: Sources) -> Filmed:
+def _filmed(row: Any, models: dict[str, Any] | Missing, sources: Sources) -> dict[str, Any]:
     """One material's sums, in words."""
     latency, untold = _latency(sources, row.Index)
-    return Filmed(
-        row.Index,
-        count(row.trials, "trial"),
-        number(row.frames, 0),
-        f"{number(row.rejected, 0)} ({percent(100 * row.rejected / max(row.frames, 1), 2)})",
-        row.reasons,
-        f"{short(1000 * row.deviation, 2)}{THIN}·10⁻³ mm³/s",
-        percent(100 * row.observable, 3),
-        number(row.outliers, 0),
-        _calibration(models, row.Index),
-        latency,
-        untold,
-        _delay(sources, row.Index),
-    )
+    return {
+        "material": row.Index,
+        "trials": count(row.trials, "trial"),
+        "frames": number(row.frames, 0),
+        "rejected": f"{number(row.rejected, 0)} ({percent(100 * row.rejected / max(row.frames, 1), 2)})",
+        "why": row.reasons,
+        "deviation": f"{short(1000 * row.deviation, 2)}{THIN}·10⁻³ mm³/s",
+        "observable": percent(100 * row.observable, 3),
+        "outliers": number(row.outliers, 0),
+        "calibration": _calibration(models, row.Index),
+        "latency": latency,
+        "untold": untold,
+        "delay": _delay(sources, row.Index),
+    }
 
 
 def _latency(sources: Sources, material: str) -> tuple[str, bool]:
     """How late the camera is against the gantry, with its 90 % interval, of each routine that was learned
     through pictures; and whether the pictures of one do not tell it, so that nothing was corrected."""
-    metrics = sources.metrics["train_ilc"]
-    laws = {} if isinstance(metrics, Missing) else metrics.get(material, {})
+    laws = known(sources.metrics["train_ilc"], {}).get(material, {})
     figures = [
         figures for law, figures in laws.items() if law.startswith("pixels") and "latency_s" in figures
     ]
@@ -644,12 +579,10 @@ def _late(latency_s: float | None, deviation_s: float | None, given: bool) -> st
 
 def _delay(sources: Sources, material: str) -> str:
     """The identified delay from plunger to flow, which is not the camera's."""
-    learned = lookup(sources.tables["learned"], "materials")
-    chains = (
-        [] if isinstance(learned, Missing) else [m["chain"] for m in learned if m["material"] == material]
-    )
-    delay_s = lookup(chains[0], "extruder.delay_s") if chains else Missing("not measured", "")
-    return "not measured" if isinstance(delay_s, Missing) else f"{number(1000 * delay_s, 0)}{THIN}ms"
+    learned = known(lookup(sources.tables["learned"], "materials"), [])
+    chain = next((one["chain"] for one in learned if one["material"] == material), {})
+    delay_s = entry(chain, "extruder", "delay_s")
+    return "not measured" if delay_s is None else f"{number(1000 * delay_s, 0)}{THIN}ms"
 
 
 def _reasons(texts: Iterable[str]) -> str:
@@ -662,16 +595,11 @@ def _reasons(texts: Iterable[str]) -> str:
 
 
 def _calibration(models: dict[str, Any] | Missing, material: str) -> str:
-    calibration = (
-        Missing("not measured", "") if "." in material else lookup(models, f"{material}.calibration")
-    )
-    if isinstance(calibration, Missing):
-        return "as recorded"
-    return _residual(calibration["gain"], calibration["deviation"])
-
-
-def _residual(gain: float, deviation: float) -> str:
     """Scale of a calibration and what it left, in um and px."""
+    calibration = entry(models, material, "calibration")
+    if calibration is None:
+        return "as recorded"
+    gain, deviation = calibration["gain"], calibration["deviation"]
     return (
         f"{number(1000 * gain, 3)}{THIN}µm/px, residual {number(1000 * deviation, 2)}{THIN}µm "
         f"({number(deviation / gain, 2)}{THIN}px)"

@@ -4,19 +4,19 @@ what that took, and the pictures behind it."""
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.deposition import change as deposition_change
+from pipeline.report.deposition import card as deposition_card
 from pipeline.report.deposition import learning as deposition_learning
 from pipeline.report.deposition import parts as deposition_parts
-from pipeline.report.deposition.marks import HEADS, KIND, MARK, PAPER, real
+from pipeline.report.deposition.parts import HEADS, KIND, MARK, PAPER, real
 from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Change, Move
-from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.deposition import (
     NAMES,
@@ -29,7 +29,7 @@ from pipeline.verdict.deposition import (
     structures,
 )
 from pipeline.verdict.digits import THIN, number, percent, short
-from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.evidence import Table, gap_of, known, lookup, need, need_figure, or_empty
 from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import Figure, Missing, Question
 
@@ -72,7 +72,7 @@ SECTIONS = ("printer", "camera", "train_ilc", "segment_library", "compose_parts"
 def render(sources: Sources) -> str:
     """The text of deposition.html."""
     judged, parts = sources.verdicts["deposition"], structures(sources.evidence)
-    measured = [] if isinstance(parts, Missing) else parts
+    measured = known(parts, [])
     return page.render(
         "deposition.html",
         here="deposition",
@@ -84,10 +84,10 @@ def render(sources: Sources) -> str:
         verdict_mark=MARK.get(judged.winner, "model_based"),
         beforehand=_beforehand(sources),
         real=real(sources),
-        no_scores=parts if isinstance(parts, Missing) else None,
+        no_scores=gap_of(parts),
         answers=[
             _answer(part, move, data_driven(measured))
-            for part, move in itertools.zip_longest(measured, deposition_change.moves(sources, measured))
+            for part, move in itertools.zip_longest(measured, deposition_card.moves(sources, measured))
         ],
         scoreboard=scoreboard(measured, sources.declared.rules),
         learning=deposition_learning.pictures(sources),
@@ -128,8 +128,8 @@ def _heads_of_rules(winner: str) -> tuple[str, ...]:
 
 
 def _beforehand(sources: Sources) -> str:
-    before, lessons = gamma(sources.evidence), sources.tables["lessons"]
-    other = [] if isinstance(lessons, Missing) else sorted(set(lessons["routine"].tolist()) - {0})
+    before, lessons = gamma(sources.evidence), known(sources.tables["lessons"], None)
+    other = sorted(set(lessons["routine"].tolist()) - {0}) if lessons else []
     instead = f"Shown is routine {other[0]}: the reference is not recorded. " if other else ""
     instead += _floor(sources)
     if before is None:
@@ -152,8 +152,7 @@ def _beforehand(sources: Sources) -> str:
 def _floor(sources: Sources) -> str:
     """Another kind of machine than printer.command says, and the least error that the declared drive allows,
     the worst of materials and routines."""
-    learning = sources.evidence.figures["train_ilc"]
-    materials = {} if isinstance(learning, Missing) else learning
+    materials = known(sources.metrics["train_ilc"], {})
     ratios = [
         headroom["least_ratio"]
         for material in materials.values()
@@ -294,19 +293,10 @@ def flat(data: Any, name: str = "") -> list[tuple[str, str]]:
 # ---- the library
 
 
-def _step(sources: Sources) -> float:
-    step_s = lookup(sources.tables["learned"], "sample_time_s")
-    return float("nan") if isinstance(step_s, Missing) else float(step_s)
-
-
+@as_picture("signals", "Its signals")
 def signals(sources: Sources) -> Picture:
     """Each basis signal from its lead to its end, materials beside one another."""
-    table, title = sources.tables["library"], "Its signals"
-    if isinstance(table, Missing) or isinstance(sources.tables["learned"], Missing):
-        return placeholder(
-            "signals", title, table if isinstance(table, Missing) else sources.tables["learned"]
-        )
-    Ts = _step(sources)
+    table, Ts = need(sources.tables["library"]), float(need(sources.tables["learned"])["sample_time_s"])
     shown: list[PictureColumn] = []
     leads: dict[str, float] = {}
     materials = [str(name) for name in dict.fromkeys(table["material"])][:MATERIALS]
@@ -321,8 +311,6 @@ def signals(sources: Sources) -> Picture:
         shown.append(PictureColumn(f"Material {material}", "", "", panels))
     text = ", ".join(f"{task} {number(seconds, 2)}{THIN}s" for task, seconds in leads.items())
     return Picture(
-        "signals",
-        title,
         f"Each signal begins ahead of its event: {text}. A line shorter than the lead of "
         "Stop has no room for it.",
         shown,
@@ -381,28 +369,22 @@ def _panel(table: Table, rows: np.ndarray, task: str, material: str, Ts: float, 
             dy=8,
         )
     )
-    alt = (
-        f"{task} of material {material}: begins {number(lead, 2)} s ahead of its event "
-        f"and peaks at {short(most, 2)} times the steady command"
-    )
     return charts.panel(
-        frame, layers, alt=alt, css="mb wide", title="× steady" if titled else "", units=("s", "×")
+        frame,
+        layers,
+        alt=f"{task} of material {material}: begins {number(lead, 2)} s ahead of its event "
+        f"and peaks at {short(most, 2)} times the steady command",
+        css="mb wide",
+        title="× steady" if titled else "",
+        units=("s", "×"),
     )
 
 
-class Tested(NamedTuple):
-    """What was measured of an assumption on one material, in words."""
-
-    text: str
-    bad: bool
-
-
+@as_table()
 def assumptions(sources: Sources) -> dict[str, Any]:
     """The paper's assumptions 1 to 4: what was found of each, by material, against the largest predicted
     error that compose_parts lets pass."""
-    checks = lookup(sources.tables["learned"], "checks", what="the check of the assumptions")
-    if isinstance(checks, Missing):
-        return {"missing": checks}
+    checks = need_figure(sources.tables["learned"], "checks", what="the check of the assumptions")
     limit = sources.declared.everything.get("compose_parts", {}).get("largest_error_percent", 20)
     tests = pd.DataFrame(checks, columns=["assumption", "claim", "material", "percent"])
     by_claim = tests.set_index(["assumption", "claim", "material"])["percent"].astype(float)
@@ -411,7 +393,7 @@ def assumptions(sources: Sources) -> dict[str, Any]:
     for (place, claim), percents in measured.iterrows():
         name, _, what = claim.partition(": ")
         cells = [
-            Tested("not tested" if math.isnan(value) else percent(value, 2), value > limit)
+            {"text": "not tested" if math.isnan(value) else percent(value, 2), "bad": value > limit}
             for value in percents
         ]
         rows.append(
@@ -420,19 +402,17 @@ def assumptions(sources: Sources) -> dict[str, Any]:
                 "name": name,
                 "what": what,
                 "cells": cells,
-                "holds": not any(cell.bad for cell in cells),
+                "holds": not any(cell["bad"] for cell in cells),
             }
         )
-    return {"missing": None, "rows": rows, "materials": list(measured.columns), "limit": f"{limit:g}{THIN}%"}
+    return {"rows": rows, "materials": list(measured.columns), "limit": f"{limit:g}{THIN}%"}
 
 
+@as_table()
 def chains(sources: Sources) -> dict[str, Any]:
     """Parameters of each machine: as known beforehand, as identified,
     and, where it is simulated, as it truly is."""
-    models, learned = sources.tables["models"], lookup(sources.tables["learned"], "materials")
-    for missing in (learned, models):
-        if isinstance(missing, Missing):
-            return {"missing": missing}
+    learned, models = need_figure(sources.tables["learned"], "materials"), need(sources.tables["models"])
     heads, values = [], []
     for material in learned[:MATERIALS]:
         name = str(material["material"])
@@ -445,35 +425,37 @@ def chains(sources: Sources) -> dict[str, Any]:
             if extruder:
                 heads.append({"material": name, "word": word})
                 values.append(extruder)
-    rows = [
-        {
-            "title": title,
-            "cells": [
-                "none" if extruder.get(key) is None else short(float(extruder[key]), 3) for extruder in values
-            ],
-        }
-        for key, title in CHAIN
-        if any(extruder.get(key) for extruder in values)
-    ]
     fits = [
         f"{material['material']}: on trials that it was not fitted to the chain misses "
         f"{percent(material['chain']['held_out_percent'], 2)} of the flow’s movement"
         for material in learned[:MATERIALS]
         if material["chain"].get("held_out_percent") is not None
     ]
-    return {"missing": None, "rows": rows, "heads": heads, "fit": "; ".join(fits)}
+    return {
+        "rows": [
+            {
+                "title": title,
+                "cells": [
+                    "none" if extruder.get(key) is None else short(float(extruder[key]), 3)
+                    for extruder in values
+                ],
+            }
+            for key, title in CHAIN
+            if any(extruder.get(key) for extruder in values)
+        ],
+        "heads": heads,
+        "fit": "; ".join(fits),
+    }
 
 
+@or_empty
 def slicer(sources: Sources) -> list[dict[str, str]]:
     """Pressure advance of each material as a slicer takes it, each number with its 90 % interval, and the
     lines that set it; no number of a material if no forecast of it is judged."""
-    materials = lookup(sources.tables["learned"], "slicer")
-    if isinstance(materials, Missing):
-        return []
-    parts = structures(sources.evidence)
-    streams = [] if isinstance(parts, Missing) else parts
-    known = {stream.material for stream in streams if not stream.unknown()}
-    unknown = {stream.material for stream in streams} - known
+    materials = need_figure(sources.tables["learned"], "slicer")
+    streams = known(structures(sources.evidence), [])
+    judged = {stream.material for stream in streams if not stream.unknown()}
+    unknown = {stream.material for stream in streams} - judged
     return [
         {"material": name, "lines": NOT_JUDGED} | dict.fromkeys(SLICER, NOT_JUDGED)
         if name in unknown
@@ -488,14 +470,16 @@ def _with_ends(values: Sequence[float], places: int) -> str:
     return f"{value} ({low} to {high})"
 
 
+@as_table()
 def columns(sources: Sources) -> dict[str, Any]:
     """The matrix (3), a row for each of its columns."""
-    table = sources.tables["library"]
-    if isinstance(table, Missing):
-        return {"missing": table}
+    table = need(sources.tables["library"])
     library = pd.DataFrame(table)
-    rows = [_signal(row, _step(sources)) for row in library.head(MOST).itertuples()]
-    return {"missing": None, "rows": rows, "more": max(len(library) - MOST, 0)}
+    Ts = float(known(lookup(sources.tables["learned"], "sample_time_s"), math.nan))
+    return {
+        "rows": [_signal(row, Ts) for row in library.head(MOST).itertuples()],
+        "more": max(len(library) - MOST, 0),
+    }
 
 
 def _signal(row: Any, Ts: float) -> dict[str, Any]:

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.deposition.marks import LINE, MARK, PAPER, real
+from pipeline.deposition.controllers import COMPOSERS
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.deposition import (
     BASELINE,
@@ -25,7 +25,7 @@ from pipeline.verdict.deposition import (
     unknown_streams,
 )
 from pipeline.verdict.digits import MINUS, THIN, count, number, percent, short
-from pipeline.verdict.evidence import Table
+from pipeline.verdict.evidence import Absent, Table, instead, known, need
 from pipeline.verdict.verdict import Missing
 
 # parts and streams that are drawn; the others stand in the tables
@@ -55,25 +55,24 @@ def _streams(table: Table) -> list[tuple[str, str]]:
 def _judged(sources: Sources, name: str) -> Table | Missing:
     """The rows of a table of forecasts whose stream is simulated or judged: no other has a figure."""
     table, unknown = sources.tables[name], unknown_streams(sources.evidence)
-    if isinstance(table, Missing) or not unknown:
-        return table
+    if not unknown:
+        return need(table)
     tools = {one["tool"]: one["name"] for one in sources.declared.everything["printer"]["materials"]}
-    materials = [tools.get(tool) for tool in table["tool"].tolist()]
+    materials = [tools.get(tool) for tool in need(table)["tool"].tolist()]
     streams = zip(table["part"].tolist(), materials, strict=True)
     rows = np.array([stream not in unknown for stream in streams])
     if not rows.any():
-        return Missing(NOT_JUDGED, "The verdict says which trial judges it")
-    return {column: values[rows] for column, values in table.items()}
+        raise Absent(Missing(NOT_JUDGED, "The verdict says which trial judges it"))
+    return {column: values[rows] for column, values in need(table).items()}
 
 
 # ---- the picture of a part
 
 
+@instead(lambda gap: [placeholder("maps", "The parts, coloured by flow error", gap)])
 def maps(sources: Sources) -> list[Picture]:
     """Every part from above, coloured by the error of the flow where it prints."""
     table = _judged(sources, "signals")
-    if isinstance(table, Missing):
-        return [placeholder("maps", "The parts, coloured by flow error", table)]
     parts = list(dict.fromkeys(table["part"].tolist()))
     return [
         _map(sources, table, str(part), i, last=part == parts[:PARTS][-1])
@@ -83,8 +82,7 @@ def maps(sources: Sources) -> list[Picture]:
 
 def _library(sources: Sources) -> str:
     """The library's better rule, which answers for data-driven composers."""
-    found = structures(sources.evidence)
-    return data_driven([] if isinstance(found, Missing) else found)
+    return data_driven(known(structures(sources.evidence), []))
 
 
 def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Picture:
@@ -107,8 +105,6 @@ def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Pi
         panel = _drawn(mine, error, prints, alt)
         shown.append(PictureColumn(NAMES[name], PAPER[name], MARK[name], [panel, _shares(error[prints])]))
     return Picture(
-        f"part-{i}",
-        part,
         f"Share of the printing time within ±{100 * RIGHT:g}{THIN}% of a full line’s flow: "
         f"{', '.join(shares)}.",
         shown,
@@ -119,7 +115,9 @@ def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Pi
         f"±{100 * RIGHT:g}{THIN}%, dots and dark beyond ±{100 * FAR:g}{THIN}% of a full line’s flow; "
         "of a long part the worst of each stretch. "
         f"{'Forecast.' if real(sources) else 'True flow of the simulated machine.'}",
-        page.origin(sources.source("signals"), part=part),
+        page.origin(sources.source("signals"), part=part, y=lines_of((_library(sources), OURS, BASELINE))),
+        f"part-{i}",
+        part,
     )
 
 
@@ -227,21 +225,11 @@ def _path(px: np.ndarray, py: np.ndarray) -> str:
 # ---- the worst stretch
 
 
+@as_picture("stretches", "Flow where the chosen signal errs most")
 def stretches(sources: Sources) -> Picture:
     """Wanted flow and that of every composer where the chosen one errs most, a row for each stream."""
-    table, scores, title = (
-        _judged(sources, "signals"),
-        sources.tables["scores"],
-        "Flow where the chosen signal errs most",
-    )
-    if isinstance(table, Missing):
-        return placeholder("stretches", title, table)
-    rows = (
-        ()
-        if isinstance(scores, Missing)
-        else zip(*(scores[name] for name in ("part", "material", "composer", "chosen")), strict=True)
-    )
-    chosen = {(part, material): str(composer) for part, material, composer, taken in rows if taken}
+    table, parts = _judged(sources, "signals"), known(structures(sources.evidence), [])
+    chosen = {(one.part, one.material): one.chosen for one in parts if one.chosen}
     worst_of_each = [
         _stretch(table, part, material, chosen.get((part, material), "basis"))
         for part, material in _streams(table)[:STREAMS]
@@ -254,8 +242,6 @@ def stretches(sources: Sources) -> Picture:
     shown = [PictureColumn(stretch.name, "", "", [_panel(stretch, names)]) for stretch in worst_of_each]
     worst = {name: max(stretch.off(name) for stretch in worst_of_each) for name in names}
     return Picture(
-        "stretches",
-        title,
         f"In its worst {STRETCH_S:g}{THIN}s, of any structure, the flow is off by at most: "
         f"{', '.join(f'{NAMES[name]} {percent(off, 2)}' for name, off in worst.items())} of "
         "a full line’s, r.m.s.",
@@ -263,8 +249,13 @@ def stretches(sources: Sources) -> Picture:
         f"{'Forecast' if real(sources) else 'True'} flow in mm³/s against time in s, "
         f"the {STRETCH_S:g} s around the largest error of the signal that was chosen; dashed: wanted; "
         f"{', '.join(f'{k} {NAMES[name].lower()}' for k, name in enumerate(names, 1))}.",
-        page.origin(sources.source("signals")),
+        page.origin(sources.source("signals"), y=lines_of(names)),
     )
+
+
+def lines_of(names: Sequence[str]) -> list[str]:
+    """The wanted flow and that of these composers, as the table of signals calls them."""
+    return [f"{name}_mm3_per_s" for name in ("wanted", *names)]
 
 
 class Stretch(NamedTuple):
@@ -347,11 +338,10 @@ def draw_flows(
 # ---- by the prints that were learned from
 
 
+@as_picture("by-prints", "Model-based or data-driven, by prints spent")
 def by_prints(sources: Sources) -> Picture:
     """Flow error of the composers over one another by the prints that each had learned from."""
-    table, title = sources.tables["prints"], "Model-based or data-driven, by prints spent"
-    if isinstance(table, Missing):
-        return placeholder("by-prints", title, table)
+    table = need(sources.tables["prints"])
     names = (OURS, _library(sources), REFERENCE, "pressure_advance_lead")
     frame = pd.DataFrame(table)
     drawn = [name for name in names if name in set(frame.composer)]
@@ -361,11 +351,9 @@ def by_prints(sources: Sources) -> Picture:
         for rows in [frame[(frame.part == part) & (frame.material == material)]]
     ]
     if not columns:
-        return placeholder("by-prints", title, Missing("not measured", "No simulated machine tells it"))
+        raise Absent(Missing("not measured", "No simulated machine tells it"))
     listed = ", ".join(f"{k} {NAMES[name].lower()}" for k, name in enumerate(drawn, 1))
     return Picture(
-        "by-prints",
-        title,
         pair_sentence(sources.evidence).note,
         columns,
         "Flow error in % of on\u2011off control’s against prints, both log scale; grey line: the limit. "
@@ -405,37 +393,36 @@ def _spent_panel(rows: pd.DataFrame, names: Sequence[str], sources: Sources) -> 
 # ---- the lines
 
 
+@as_table()
 def lines(sources: Sources) -> dict[str, Any]:
     """The lines that are furthest from their volume, the worst first."""
     table = _judged(sources, "lines")
-    if isinstance(table, Missing):
-        return {"missing": table}
     allowed = sources.declared.rules.line_volume_percent
     printed = pd.DataFrame(table).fillna({"error_percent": 0.0})
     printed["off_percent"] = printed.error_percent.abs()
-    rows = [
-        {
-            "part": row.part,
-            "line": row.line,
-            "tool": f"T{row.tool}",
-            "duration": number(row.duration_s, 2),
-            "planned": number(row.planned_mm3, 3),
-            "predicted": number(row.predicted_mm3, 3),
-            "on_off": _signed(100 * (row.on_off_mm3 / max(row.planned_mm3, 1e-12) - 1)),
-            "error": _signed(row.error_percent),
-            "bad": row.off_percent > allowed,
-            "short": row.shorter_than_lead,
-        }
-        for row in printed.nlargest(WORST, "off_percent").itertuples()
-    ]
     beyond, short_runs = int((printed.off_percent > allowed).sum()), int(printed.shorter_than_lead.sum())
-    summary = (
-        f"Of {count(len(printed), 'line')}, {'none is' if not beyond else count(beyond, 'is', 'are')} "
+    return {
+        "rows": [
+            {
+                "part": row.part,
+                "line": row.line,
+                "tool": f"T{row.tool}",
+                "duration": number(row.duration_s, 2),
+                "planned": number(row.planned_mm3, 3),
+                "predicted": number(row.predicted_mm3, 3),
+                "on_off": _signed(100 * (row.on_off_mm3 / max(row.planned_mm3, 1e-12) - 1)),
+                "error": _signed(row.error_percent),
+                "bad": row.off_percent > allowed,
+                "short": row.shorter_than_lead,
+            }
+            for row in printed.nlargest(WORST, "off_percent").itertuples()
+        ],
+        "summary": f"Of {count(len(printed), 'line')}, "
+        f"{'none is' if not beyond else count(beyond, 'is', 'are')} "
         f"predicted more than {allowed:g}{THIN}% off {'its' if beyond <= 1 else 'their'} volume; "
         f"{count(short_runs, 'belongs', 'belong') if short_runs else 'none belongs'} to runs shorter than "
-        "the lead of Stop."
-    )
-    return {"missing": None, "rows": rows, "summary": summary}
+        "the lead of Stop.",
+    }
 
 
 def _signed(value: float) -> str:
@@ -446,47 +433,25 @@ def _signed(value: float) -> str:
 # ---- what limits a part, and what was refused
 
 
-class Forecast(NamedTuple):
-    """What one stream of a part comes to, with 90 % certainty, and what it asks of the drive, in words."""
-
-    part: str
-    material: str
-    mark: str
-    composer: str
-    interval: str
-    why: str
-    measured: str
-    time: str
-    lines: str
-    short: str
-    peak: str
-    speed: str
-    limit: str
-    share: str
-    bad: bool
-    error: str
-    ramp: str
-
-
+@as_table()
 def forecasts(sources: Sources) -> dict[str, Any]:
     """By part and material: composer, saturation and the ramp that would do, and lines that need a look."""
-    conformance = sources.tables["conformance"]
-    if isinstance(conformance, Missing):
-        return {"missing": conformance}
-    unknown, parts = unknown_streams(sources.evidence), structures(sources.evidence)
+    conformance = need(sources.tables["conformance"])
+    unknown, parts = unknown_streams(sources.evidence), known(structures(sources.evidence), [])
     # the verdict gives the reason of the first; here it would stand again
-    said = next((part.why for part in ([] if isinstance(parts, Missing) else parts) if part.unknown()), "")
-    rows = [
-        _forecast(part, material, report, (part, material) in unknown, said)
-        for part, report in conformance.items()
-        for material in report.get("saturation", {})
-    ]
-    return {"missing": None, "rows": rows}
+    said = next((part.why for part in parts if part.unknown()), "")
+    return {
+        "rows": [
+            _forecast(part, material, report, (part, material) in unknown, said)
+            for part, report in conformance.items()
+            for material in report.get("saturation", {})
+        ]
+    }
 
 
-def _forecast(part: str, material: str, report: dict[str, Any], unknown: bool, said: str) -> Forecast:
-    """One stream out of the conformance report of its part; no figure of the flow if that is unknown, and no
-    reason that is already said."""
+def _forecast(part: str, material: str, report: dict[str, Any], unknown: bool, said: str) -> dict[str, Any]:
+    """One stream out of the conformance report of its part: what it comes to, with 90 % certainty, and what
+    it asks of the drive; no figure of the flow if that is unknown, and no reason that is already said."""
     drive = report["saturation"][material]
     asked = asked_of_the_drive(part, material, drive)
     ramp = report.get("ramp_that_would_do_s", {}).get(material)
@@ -495,25 +460,27 @@ def _forecast(part: str, material: str, report: dict[str, Any], unknown: bool, s
         remedy = "as it is"
     else:
         remedy = "none would do" if ramp is None else f"{number(float(ramp), 2)}{THIN}s"
-    return Forecast(
-        part,
-        material,
-        MARK.get(composer, "baseline"),
-        NAMES.get(composer, composer),
-        *_told(report.get("forecast", {}).get(material), said),
-        time=number(float(report.get("duration_s", 0.0)), 1),
-        lines=f"{report.get('printed_lines', 0):,} in {report.get('runs', 0):,}",
-        short=number(float(report.get("shorter_than_lead", 0)), 0),
-        peak=f"{short(asked.command_mm, 2)} ({short(float(drive['peak_over_steady']), 2)} ×)",
-        speed=short(asked.speed_mm_per_s, 2),
-        limit="not declared" if asked.limit() == "declared" else asked.limit(),
-        share=percent(asked.share, 2),
-        bad=not asked.enough,
-        error=NOT_JUDGED
-        if unknown
-        else _beside(drive.get("rms_percent_of_on_off"), drive.get("least_percent")),
-        ramp=remedy,
-    )
+    interval, why, measured = _told(report.get("forecast", {}).get(material), said)
+    error = _beside(drive.get("rms_percent_of_on_off"), drive.get("least_percent"))
+    return {
+        "part": part,
+        "material": material,
+        "mark": MARK.get(composer, "baseline"),
+        "composer": NAMES.get(composer, composer),
+        "interval": interval,
+        "why": why,
+        "measured": measured,
+        "time": number(float(report.get("duration_s", 0.0)), 1),
+        "lines": f"{report.get('printed_lines', 0):,} in {report.get('runs', 0):,}",
+        "short": number(float(report.get("shorter_than_lead", 0)), 0),
+        "peak": f"{short(asked.command_mm, 2)} ({short(float(drive['peak_over_steady']), 2)} ×)",
+        "speed": short(asked.speed_mm_per_s, 2),
+        "limit": "not declared" if asked.limit() == "declared" else asked.limit(),
+        "share": percent(asked.share, 2),
+        "bad": not asked.enough,
+        "error": NOT_JUDGED if unknown else error,
+        "ramp": remedy,
+    }
 
 
 def _beside(error: float | None, least: float | None) -> str:
@@ -534,27 +501,14 @@ def _told(forecast: dict[str, Any] | None, said: str) -> tuple[str, str, str]:
     return f"{percent(forecast['low'], 2)} to {percent(forecast['high'], 2)}", "", beside
 
 
-class Tool(NamedTuple):
-    """What one tool of a part presses out, by E and by the declared bead, in words."""
-
-    part: str
-    tool: str
-    source: str
-    by_e: str = "not told"
-    declared: str = ""
-    difference: str = ""
-    area: str = ""
-
-
+@as_table()
 def extruded(sources: Sources) -> dict[str, Any]:
     """By part and tool the volume that E asks for beside the declared bead's, or why E does not count."""
-    conformance = sources.tables["conformance"]
-    if isinstance(conformance, Missing):
-        return {"missing": conformance}
+    conformance = need(sources.tables["conformance"])
     told = [(part, report["program"]) for part, report in conformance.items() if "program" in report]
     if not told:
-        return {"missing": Missing("not measured", "the conformance report is of an earlier version",
-                             "Run ./run dvc repro compose_parts")}  # fmt: skip
+        earlier = "the conformance report is of an earlier version"
+        raise Absent(Missing("not measured", earlier, "Run ./run dvc repro compose_parts"))
     rows, shares = [], []
     for part, program in told:
         found = {f"T{one['tool']}": one for one in program["e_beside_declared_bead"]}
@@ -562,38 +516,35 @@ def extruded(sources: Sources) -> dict[str, Any]:
         shares += [one["by_e_mm3"] / one["declared_mm3"] for one in found.values() if one["declared_mm3"] > 0]
     if not shares:
         return {
-            "missing": None,
             "rows": rows,
             "summary": "No line’s volume is E’s: each is its length times the declared bead’s area.",
         }
     times = " to ".join(dict.fromkeys(short(share, 3) for share in (min(shares), max(shares))))
-    summary = (
-        f"E gives the volumes of {len(shares)} of {count(len(rows), 'tool')}; it asks for {times} times the "
-        "declared bead’s."
-    )
-    return {"missing": None, "rows": rows, "summary": summary}
+    return {
+        "rows": rows,
+        "summary": f"E gives the volumes of {len(shares)} of {count(len(rows), 'tool')}; it asks for "
+        f"{times} times the declared bead’s.",
+    }
 
 
-def _tool(part: str, tool: str, source: str, one: dict[str, Any] | None) -> Tool:
+def _tool(part: str, tool: str, source: str, one: dict[str, Any] | None) -> dict[str, str]:
+    """What one tool of a part presses out, by E and by the declared bead."""
+    named = {"part": part, "tool": tool, "source": source}
     if one is None:
-        return Tool(part, tool, source)
+        return named | {"by_e": "not told", "declared": "", "difference": "", "area": ""}
     by_e, declared, (low, middle, high) = one["by_e_mm3"], one["declared_mm3"], one["area_mm2"]
-    return Tool(
-        part,
-        tool,
-        source,
-        short(by_e, 4),
-        short(declared, 4),
-        _signed(100 * (by_e / declared - 1)) if declared > 0 else "",
-        f"{short(low, 3)} to {short(high, 3)}, half of the length below {short(middle, 3)}",
-    )
+    return named | {
+        "by_e": short(by_e, 4),
+        "declared": short(declared, 4),
+        "difference": _signed(100 * (by_e / declared - 1)) if declared > 0 else "",
+        "area": f"{short(low, 3)} to {short(high, 3)}, half of the length below {short(middle, 3)}",
+    }
 
 
+@as_table()
 def refused(sources: Sources) -> dict[str, Any]:
     """Lines and whole parts that were refused, each with its sentence."""
-    conformance = sources.tables["conformance"]
-    if isinstance(conformance, Missing):
-        return {"missing": conformance}
+    conformance = need(sources.tables["conformance"])
     rows = []
     for part, report in conformance.items():
         why = report.get("refused", [])
@@ -607,9 +558,36 @@ def refused(sources: Sources) -> dict[str, Any]:
         for part, report in conformance.items()
         if report.get("unknown_words")
     ]
-    return {
-        "missing": None,
-        "rows": rows[:REFUSED],
-        "more": max(len(rows) - REFUSED, 0),
-        "unknown": ", ".join(unknown),
-    }
+    return {"rows": rows[:REFUSED], "more": max(len(rows) - REFUSED, 0), "unknown": ", ".join(unknown)}
+
+
+# what stands below a heading
+PAPER = {row.name: row.explanation for row in COMPOSERS}
+# marks of the other pages by kind, the second of a kind hollow: circle data-driven, square model-based and
+# the reference, ring on-off control, a shape of its own every other baseline
+_MARKS = {
+    "model-based": ("model_based", "exact_model"),
+    "data-driven": ("data_driven", "kernel"),
+    "baseline": ("baseline", "triangle", "diamond"),
+    "reference": ("exact_model",),
+}
+_OF_KIND = {kind: [row.name for row in COMPOSERS if row.kind == kind] for kind in _MARKS}
+MARK = {row.name: _MARKS[row.kind][_OF_KIND[row.kind].index(row.name)] for row in COMPOSERS}
+KIND = {row.name: row.kind for row in COMPOSERS}
+# of composers that are drawn over one another; of the data-driven ones blue
+LINE = {
+    "basis": "line",
+    "priority": "line dd",
+    "superposition": "line dd dash",
+    "pressure_advance": "line bl dash",
+    "pressure_advance_lead": "line bl dash",
+    "on_off": "line bl",
+    "ilc": "line dash",
+}
+# what the two columns of its rules are, the mark of the second and that of the first
+HEADS = ("Model\u2011based", "Data\u2011driven", "data_driven", "model_based")
+
+
+def real(sources: Sources) -> bool:
+    """Whether the trials are a machine's own, so that nobody knows its true flow."""
+    return sources.evidence.recorded("train_ilc")

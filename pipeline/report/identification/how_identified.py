@@ -2,11 +2,24 @@
 forbids, what was chosen, and every output's fits with and without a free mean."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
+import numpy as np
+
+from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.digits import THIN, band, count, decimals, number, short
-from pipeline.verdict.evidence import lookup
+from pipeline.verdict.digits import THIN, band, count, decimals, listed, number, short
+from pipeline.verdict.evidence import (
+    Absent,
+    Table,
+    gap_of,
+    instead,
+    known,
+    lookup,
+    need,
+    need_figure,
+    or_empty,
+)
 from pipeline.verdict.identification import (
     Fit,
     band_of,
@@ -17,6 +30,7 @@ from pipeline.verdict.identification import (
 )
 from pipeline.verdict.verdict import Figure, Missing
 
+MOST_INPUTS = 7  # panels in a row of a matrix; a machine with more shows the strongest
 LEAST_P = 1e-6  # smaller ones are all the same to a reader
 
 REFINED = {
@@ -29,47 +43,43 @@ REFINED = {
 # ---- open or closed loop
 
 
-class LoopState(NamedTuple):
-    """Open or closed loop in a word, the test behind it, and what follows; `missing` where it was not
-    tested."""
-
-    closed: bool
-    head: str
-    test: str
-    follows: str
-    missing: Missing | None = None
-
-
-def loop_state(sources: Sources) -> LoopState:
-    """Whether inputs answered what the outputs did, and what follows for the model."""
-    tested = lookup(sources.metrics["identify_plant"], "closed_loop", what="the test for feedback")
-    if isinstance(tested, Missing):
-        return LoopState(False, "", "", "", tested)
+@as_table(closed=False)
+def loop_state(sources: Sources) -> dict[str, Any]:
+    """Whether inputs answered what the outputs did: in a word, the test behind it, and what follows for the
+    model."""
+    tested = need_figure(sources.metrics["identify_plant"], "closed_loop", what="the test for feedback")
     p_values = tested["p_value"]
     if not p_values:
         reason = "the record is noise-free: it holds no errors that an input could answer"
-        return LoopState(False, "", "", "", Missing("not applicable", reason))
+        raise Absent(Missing("not applicable", reason))
     level = tested.get("level", 0.0)
     if tested["closed"]:
         answering = [name for name, p in p_values.items() if p < level] or [min(p_values, key=p_values.get)]
         largest = max(p_values[name] for name in answering)
         test = (
-            f"{_listed(answering)} {'answers' if len(answering) == 1 else 'answer'} past errors of the "
+            f"{listed(answering)} {'answers' if len(answering) == 1 else 'answer'} past errors of the "
             f"outputs ({_p(largest)}), as a controller does."
         )
-        return LoopState(True, "Recorded in closed loop.", test, _closed_follows(sources))
+        return {
+            "closed": True,
+            "head": "Recorded in closed loop.",
+            "test": test,
+            "follows": _closed_follows(sources),
+        }
     nearest = min(p_values, key=p_values.get)
     threshold = f"; feedback is called below {short(level, 2)}" if level else ""
     test = (
         f"No input is seen to answer past errors of the outputs: least {_p(p_values[nearest])}, "
         f"{nearest}{threshold}."
     )
-    follows = (
-        "The model is identified as from an open loop. A weak proportional controller whose set-point never "
-        "moves stays below this test: where the machine had one, believe the fit some steps ahead before the "
-        "simulation."
-    )
-    return LoopState(False, "No feedback was recognised.", test, follows)
+    return {
+        "closed": False,
+        "head": "No feedback was recognised.",
+        "test": test,
+        "follows": "The model is identified as from an open loop. A weak proportional controller whose "
+        "set-point never moves stays below this test: where the machine had one, believe the fit some steps "
+        "ahead before the simulation.",
+    }
 
 
 def _closed_follows(sources: Sources) -> str:
@@ -95,38 +105,24 @@ def _p(value: float) -> str:
     return "p below 0.000001" if value < LEAST_P else f"p = {short(value, 2)}"
 
 
-def _listed(items: Sequence[str]) -> str:
-    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
-
-
 # ---- gains that physics forbids
 
 
+@as_table(finding="", rows=[])
 def flagged(sources: Sources) -> dict[str, Any]:
     """Gains of heaters with a sign or a size that physics forbids."""
-    gains = lookup(sources.metrics["identify_plant"], "forbidden_gains", what="the check of signs and sizes")
-    if isinstance(gains, Missing):
-        return {"finding": "", "rows": [], "missing": gains}
+    gains = need_figure(
+        sources.metrics["identify_plant"], "forbidden_gains", what="the check of signs and sizes"
+    )
     machine = sources.declared.machine
     heaters = [signal.name for signal in machine.inputs if signal.heats]
     if not heaters:
         reason = "no input is declared to heat, so no sign is known to be wrong"
-        return {
-            "finding": "",
-            "rows": [],
-            "missing": Missing("not applicable", reason, "Set heats: true for heaters in plant.inputs"),
-        }
-    if not gains:
-        return {
-            "finding": f"None: every effect of {_listed(heaters)} is one that a heater can have.",
-            "rows": [],
-            "missing": None,
-        }
-    return {
-        "finding": f"{flagged_sentence(gains)} {flagged_remedy(gains)}",
-        "rows": [_flagged_row(gain) for gain in gains],
-        "missing": None,
-    }
+        raise Absent(Missing("not applicable", reason, "Set heats: true for heaters in plant.inputs"))
+    finding = f"None: every effect of {listed(heaters)} is one that a heater can have."
+    if gains:
+        finding = f"{flagged_sentence(gains)} {flagged_remedy(gains)}"
+    return {"finding": finding, "rows": [_flagged_row(gain) for gain in gains]}
 
 
 def _flagged_row(gain: dict[str, Any]) -> dict[str, Any]:
@@ -156,7 +152,7 @@ def chosen_rows(sources: Sources) -> list[tuple[str, str]]:
     ]
     disturbances = [signal.name for signal in sources.declared.machine.disturbances]
     return [
-        *((name, value.state if isinstance(value, Missing) else words()) for name, value, words in rows),
+        *((name, gap.state if (gap := gap_of(value)) else words()) for name, value, words in rows),
         ("Measured disturbances", ", ".join(disturbances) or "none declared (plant.disturbances)"),
     ]
 
@@ -164,7 +160,7 @@ def chosen_rows(sources: Sources) -> list[tuple[str, str]]:
 def _feedthrough(direct: dict[str, bool]) -> str:
     outputs = [name for name, free in direct.items() if free]
     return (
-        f"{_listed(outputs)}, {len(outputs)} of {count(len(direct), 'output')}" if outputs else "in no output"
+        f"{listed(outputs)}, {len(outputs)} of {count(len(direct), 'output')}" if outputs else "in no output"
     )
 
 
@@ -178,19 +174,6 @@ def left_out_words(sources: Sources) -> str:
 # ---- fits by output
 
 
-class FitRow(NamedTuple):
-    """An output's fits: simulated as it stands, with its mean free, and ahead, each with its band; what the
-    mean costs, and whether u(t) acts on it at once."""
-
-    name: str
-    simulated: tuple[str, str]
-    free: tuple[str, str]
-    cost: str
-    sure: bool
-    ahead: tuple[str, str]
-    feedthrough: str
-
-
 def fit_table(sources: Sources, fits: Sequence[Fit]) -> dict[str, Any]:
     """Every output with and without a free mean: what another ambient or operating point costs."""
     metrics = sources.metrics["identify_plant"]
@@ -199,34 +182,155 @@ def fit_table(sources: Sources, fits: Sequence[Fit]) -> dict[str, Any]:
         free = fit_figure(metrics, "fit_holdout_free_mean", fit.name)
         direct = lookup(metrics, f"feedthrough.{fit.name}")
         cost, sure = _cost(fit.simulated, free)
-        words = direct.state if isinstance(direct, Missing) else "yes" if direct else "no"
-        rows.append(FitRow(fit.name, _cell(fit.simulated), _cell(free), cost, sure, _cell(fit.ahead), words))
-    moved = [f"{row.cost} in {row.name}" for row in rows if row.sure]
-    measured = any(
-        not isinstance(fit_figure(metrics, "fit_holdout_free_mean", fit.name), Missing) for fit in fits
-    )
+        cells = {
+            key: (percent_of(value), band_of(value))
+            for key, value in (("simulated", fit.simulated), ("free", free), ("ahead", fit.ahead))
+        }
+        words = gap.state if (gap := gap_of(direct)) else "yes" if direct else "no"
+        rows.append(
+            {"name": fit.name, "cost": cost, "sure": sure, "known": not gap_of(free), "feedthrough": words}
+            | cells
+        )
+    moved = [f"{row['cost']} in {row['name']}" for row in rows if row["sure"]]
     if moved:
         finding = (
-            f"A free mean gains {_listed(moved)}: the level moved up to the hold-out, as another ambient or "
+            f"A free mean gains {listed(moved)}: the level moved up to the hold-out, as another ambient or "
             "operating point moves it. Record what does so as one of plant.disturbances."
         )
-    elif measured:
+    elif any(row["known"] for row in rows):
         finding = "A free mean gains nothing beyond noise: the level did not move up to the hold-out."
     else:
         finding = ""
     return {"finding": finding, "rows": rows}
 
 
+@instead(lambda gap: ("not measured", False))
 def _cost(simulated: Figure | Missing, free: Figure | Missing) -> tuple[str, bool]:
     """Points that a free mean gains, and whether the bands are apart."""
-    if isinstance(simulated, Missing) or isinstance(free, Missing):
-        return "not measured", False
+    simulated, free = need(simulated), need(free)
     if free.low <= simulated.high:
         return "within noise", False
     return f"{number(free.value - simulated.value, 1)} points", True
 
 
-def _cell(fit: Figure | Missing) -> tuple[str, str]:
-    if isinstance(fit, Missing):
-        return fit.state, ""
-    return percent_of(fit), band_of(fit)
+# Klipper's pid_Kp, pid_Ki and pid_Kd are of a duty of 0 to 255, ours of one in percent
+KLIPPER_FROM_PERCENT = 2.55
+
+# rows of an output with more inputs than a matrix shows: the page has a size to keep
+FEW_INPUTS = 4
+
+
+def heater_table(sources: Sources) -> dict[str, Any]:
+    """Every pair of the first-order table with a PID beside it, and the PID that the printer has."""
+    printer, note = _printer_rows(sources, sources.tables["first_order"])
+    return {"printer": printer, "printer_note": note} | _pairs(sources)
+
+
+@as_table(finding="", outputs=[])
+def _pairs(sources: Sources) -> dict[str, Any]:
+    """The first-order table, output by output; of many inputs the strongest of each output."""
+    table = need(sources.tables["first_order"])
+
+    # the longest time after a step that the step responses show
+    horizon = known(sources.tables["steps"], {"time_s": np.array([np.inf])})["time_s"].max()
+    gaps = _gaps(table, float(horizon))
+    fitted = sum(not gap for gap in gaps)
+    every = f"of {count(len(gaps), 'pair')}"
+    return {
+        "finding": f"{count(fitted, every, every).capitalize()} {'has' if fitted == 1 else 'have'} a gain of "
+        "known sign and a time constant that the record shows. Bold: the input that moves an output "
+        "furthest.",
+        "outputs": [_output_pairs(table, gaps, output.name) for output in sources.declared.machine.outputs],
+    }
+
+
+def _output_pairs(table: Table, gaps: list[str], output: str) -> dict[str, Any]:
+    mine = sorted(np.flatnonzero(table["output"] == output), key=lambda k: -abs(table["gain"][k]))
+    known = [k for k in mine if table["seen"][k]]
+    fitted = [k for k in mine if not gaps[k]]
+    fitted = fitted if len(fitted) <= MOST_INPUTS else fitted[:FEW_INPUTS]
+    rows = [_pair(table, k, k == known[0]) for k in sorted(fitted)]
+    reasons = sorted({gaps[k] for k in mine if gaps[k]})
+    sentences = [
+        f"{reason}: {shortened_list([str(table['input'][k]) for k in sorted(mine) if gaps[k] == reason])}"
+        for reason in reasons
+    ]
+    left = sum(not gaps[k] for k in mine) - len(fitted)
+    sentences += [f"{count(left, 'weaker input is', 'weaker inputs are')} not shown"] if left else []
+    return {"output": output, "rows": rows, "gaps": "; ".join(sentences)}
+
+
+def shortened_list(names: list[str]) -> str:
+    """The first names, and how many more there are."""
+    shown = ", ".join(names[:MOST_INPUTS])
+    return shown + (f" and {len(names) - MOST_INPUTS} more" if len(names) > MOST_INPUTS else "")
+
+
+def _gaps(table: Table, horizon: float) -> list[str]:
+    """Why each pair has no first-order model; empty where it has one. A time constant beyond the horizon is
+    an extrapolation of the response's beginning."""
+    slow = f"not settled within {short(horizon)}{THIN}s"
+    return [
+        "sign not known" if not seen else slow if tau > horizon else ""
+        for seen, tau in zip(table["seen"], table["time_constant_s"], strict=True)
+    ]
+
+
+def _pair(table: Table, k: int, strongest: bool) -> dict[str, Any]:
+    """K e^(-theta s) / (tau s + 1) of a pair with bands, and its PID. `strongest`: no input moves the output
+    further."""
+    Kp, Ki, Kd = (float(table[key][k]) for key in ("Kp", "Ki", "Kd"))
+    return {
+        "input": str(table["input"][k]),
+        "strongest": strongest,
+        "gain": _banded(table, "gain", k),
+        "tau": _banded(table, "time_constant_s", k),
+        "delay": _banded(table, "delay_s", k),
+        "Kp": short(Kp),
+        "Ki": {"value": short(Ki), "band": f"Ti {short(Kp / Ki, 2)}{THIN}s"},
+        "Kd": {"value": short(Kd), "band": f"Td {short(Kd / Kp, 2)}{THIN}s"},
+    }
+
+
+def _banded(table: Table, key: str, k: int) -> dict[str, str]:
+    value, low, high = (float(table[f"{key}{end}"][k]) for end in ("", "_low", "_high"))
+    places = decimals(low, high, value=value)
+    return {"value": number(value, places), "band": band(low, high, places)}
+
+
+# ---- the printer's own
+
+
+@instead(lambda gap: ([], ""))
+def _printer_rows(sources: Sources, table: Table | Missing) -> tuple[list[dict[str, Any]], str]:
+    """The printer's PID of each heater over the one by SIMC, and how both are to be read."""
+    own = need_figure(sources.tables["printer_pid"], "heaters")
+    rows = []
+    for pid in own:
+        pair = f"{pid['input']} to {pid['output']}"
+        rows.append(_pid_row(pair, "the printer’s own", [pid[key] for key in ("Kp", "Ki", "Kd")]))
+        rows.append(_pid_row(pair, "SIMC, from this record", _simc(table, pid)))
+    logs = ", ".join(sorted({pid["recording"] for pid in own}))
+    note = (
+        "Klipper’s PID is parallel too; its pid_Kp, pid_Ki, pid_Kd are of a duty of 0 to 255, 2.55 times "
+        "those in percent. Its derivative acts on the temperature, smoothed over "
+        f"{own[0]['smooth_s']:g}{THIN}s, and its duty ends at {own[0]['most_percent']:g}{THIN}%. "
+        f"From the configuration in {logs}."
+    )
+    return rows, note
+
+
+@or_empty
+def _simc(table: Table | Missing, pid: dict[str, Any]) -> list[float]:
+    table = need(table)
+    k = np.flatnonzero((table["output"] == pid["output"]) & (table["input"] == pid["input"]))
+    gains = [float(table[key][k[0]]) for key in ("Kp", "Ki", "Kd")] if len(k) else []
+    return gains if np.isfinite(gains).all() else []
+
+
+def _pid_row(pair: str, whose: str, gains: list[float]) -> dict[str, Any]:
+    """A PID of a heater in percent of duty, and as printer.cfg has it."""
+    percent, klipper = (
+        [short(gain * scale) for gain in gains] or ["none"] * 3 for scale in (1, KLIPPER_FROM_PERCENT)
+    )
+    return {"pair": pair, "whose": whose, "gains": percent, "klipper": klipper}

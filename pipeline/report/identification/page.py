@@ -2,22 +2,29 @@
 pictures behind it, and what the record lost on the way."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from pipeline.report.identification import (
-    heater_table,
-    how_identified,
-    model_dynamics,
-    model_errors,
-    next_experiment,
-)
+from pipeline.report.identification import how_identified, pictures
 from pipeline.report.shared import charts, page, words
+from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.digits import MINUS, THIN, band, count, decimals, number, percent, quantity, short
-from pipeline.verdict.evidence import lookup
-from pipeline.verdict.identification import Fit, ahead_words, fits, least_fit
+from pipeline.verdict.digits import MINUS, THIN, count, number, percent, quantity, short
+from pipeline.verdict.evidence import (
+    entry,
+    gap_of,
+    instead,
+    known,
+    lookup,
+    need,
+    need_figure,
+    or_empty,
+    or_gap,
+    or_nothing,
+)
+from pipeline.verdict.identification import Fit, ahead_words, band_of, fit_figure, fits, least_fit, percent_of
 from pipeline.verdict.verdict import FAILED, PASSED, UNDECIDED, Figure, Missing, Question, Verdict, state
 
 WORDS = (
@@ -57,18 +64,18 @@ def render(sources: Sources) -> str:
         taken=how_identified.loop_state(sources),
         flagged=how_identified.flagged(sources),
         by_output=how_identified.fit_table(sources, judged_fits),
-        heaters=heater_table.heater_table(sources),
+        heaters=how_identified.heater_table(sources),
         chosen_rows=how_identified.chosen_rows(sources),
-        holdout=model_errors.holdout(sources, judged_fits, ahead),
-        white=model_errors.whiteness(sources),
-        cross=model_errors.cross(sources),
-        steps=model_dynamics.steps(sources),
-        order=model_dynamics.order(sources),
+        holdout=pictures.holdout(sources, judged_fits, ahead),
+        white=pictures.whiteness(sources),
+        cross=pictures.cross(sources),
+        steps=pictures.steps(sources),
+        order=pictures.order(sources),
         candidates=candidates(sources),
-        poles=model_dynamics.poles(sources),
-        pole_rows=model_dynamics.pole_table(sources),
-        excitation=model_dynamics.excitation(sources),
-        planned=next_experiment.next_experiment(sources),
+        poles=pictures.poles(sources),
+        pole_rows=pictures.pole_table(sources),
+        excitation=pictures.excitation(sources),
+        planned=next_experiment(sources),
         from_planned=sources.source("generate_probing"),
         losses=losses(sources),
         used=used(sources),
@@ -80,14 +87,11 @@ def render(sources: Sources) -> str:
     )
 
 
+@or_nothing
 def _judged_on(sources: Sources) -> str:
-    metrics, share = (
-        sources.metrics["identify_plant"],
-        sources.declared.everything.get("identify_plant", {}).get("holdout_share"),
-    )
-    held, samples = lookup(metrics, "samples_holdout"), lookup(metrics, "samples")
-    if isinstance(held, Missing) or isinstance(samples, Missing) or share is None:
-        return ""
+    metrics = sources.metrics["identify_plant"]
+    share = need_figure(sources.declared.everything, "identify_plant.holdout_share")
+    held, samples = need_figure(metrics, "samples_holdout"), need_figure(metrics, "samples")
     return (
         f"Judged on the last {100 * share:g}{THIN}% of every stretch, "
         f"{number(held, 0)} of {number(samples, 0)} samples, by the model of the rest. "
@@ -102,15 +106,7 @@ def answer(sources: Sources, fit: Fit, ahead: str) -> dict[str, Any]:
     """Fits with bands, the yardstick, the share that is missed as a strip, what the
     residuals say, and the change since the accepted run."""
     question = Question(0, "", fit.name, "%", least_fit(), True, "")
-    bar = (
-        fit.held
-        if isinstance(fit.held, Missing)
-        else Question(0, "", fit.name, "%", max(fit.held.value, least_fit()), True, "")
-    )
-    states = [
-        state(question, fit.simulated),
-        fit.ahead.state if isinstance(bar, Missing) else state(bar, fit.ahead),
-    ]
+    states = [state(question, fit.simulated), _ahead_state(fit, question)]
     shown = [
         ("Simulation", "mb", _missed(fit.simulated)),
         (ahead, "mb hollow", _missed(fit.ahead)),
@@ -129,7 +125,7 @@ def answer(sources: Sources, fit: Fit, ahead: str) -> dict[str, Any]:
             _fit_cell("dd", "Simulation", fit.simulated, states[0]),
             _fit_cell("mb", ahead[:1].upper() + ahead[1:], fit.ahead, states[1]),
         ],
-        "held": _value(fit.held),
+        "held": percent_of(fit.held),
         "strip": charts.strip(
             Question(0, "", fit.name, "%", 100 - least_fit(), False, ""), shown, (11, 23, 23)
         ),
@@ -138,40 +134,33 @@ def answer(sources: Sources, fit: Fit, ahead: str) -> dict[str, Any]:
     }
 
 
+@instead(lambda gap: gap.state)
+def _ahead_state(fit: Fit, question: Question) -> str:
+    """Whether the prediction is better than holding the last value, and good enough."""
+    return state(question._replace(limit=max(need(fit.held).value, question.limit)), need(fit.ahead))
+
+
 def _fit_cell(css: str, name: str, fit: Figure | Missing, outcome: str) -> dict[str, Any]:
-    missing = fit if isinstance(fit, Missing) else None
-    bands = "" if isinstance(fit, Missing) else band(fit.low, fit.high, _places(fit), unit="%")
     return {
         "css": css,
         "name": name,
         "state": outcome.replace(" ", "-"),
-        "missing": missing,
-        "value": _value(fit),
-        "band": bands,
+        "missing": gap_of(fit),
+        "value": percent_of(fit),
+        "band": band_of(fit),
     }
 
 
-def _places(fit: Figure) -> int:
-    return min(decimals(fit.low, fit.high, value=fit.value), 1)
-
-
-def _value(fit: Figure | Missing) -> str:
-    return fit.state if isinstance(fit, Missing) else quantity(fit.value, "%", _places(fit))
-
-
-def _missed(figure: Figure | Missing) -> Figure | Missing:
+@or_gap
+def _missed(figure: Figure | Missing) -> Figure:
     """The share of the movement that the fit misses; none is 0, the mean misses 100 %."""
-    return (
-        figure
-        if isinstance(figure, Missing)
-        else Figure(100 - figure.value, 100 - figure.high, 100 - figure.low)
-    )
+    fit = need(figure)
+    return Figure(100 - fit.value, 100 - fit.high, 100 - fit.low)
 
 
+@instead(lambda gap: "residuals not measured")
 def _residual_note(sources: Sources, name: str) -> str:
-    table = sources.tables["residuals"]
-    if isinstance(table, Missing):
-        return "residuals not measured"
+    table = need(sources.tables["residuals"])
     failed = table["against"][(table["output"] == name) & ~table["passed"]]
     left = sorted({str(a) for a in failed} - {name})
     parts = ["errors not noise"] * (name in failed) + (
@@ -181,29 +170,21 @@ def _residual_note(sources: Sources, name: str) -> str:
 
 
 def _accepted(sources: Sources, name: str) -> Figure | None:
-    before = sources.accepted
-    if before is None or isinstance(before, Missing) or sources.another_machine:
+    if sources.another_machine:
         return None
-    value, ends = (
-        lookup(before, f"metrics.identify_plant.{key}.{name}") for key in ("fit_holdout", "fit_holdout_band")
-    )
-    return (
-        None
-        if isinstance(value, Missing)
-        else Figure(value, *([value, value] if isinstance(ends, Missing) else ends))
-    )
+    return known(fit_figure(lookup(sources.accepted, "metrics.identify_plant"), "fit_holdout", name), None)
 
 
 def since(before: Figure | None, now: Figure | Missing) -> tuple[str, bool]:
     """The change of a fit in points and whether it is beyond the bands of both runs."""
-    if isinstance(now, Missing):
-        return now.state, False
+    if gap := gap_of(now):
+        return gap.state, False
     if before is None:
         return "first run", False
     if math.isclose(before.value, now.value, rel_tol=1e-6):
-        return f"unchanged, {_value(before)}", False
+        return f"unchanged, {percent_of(before)}", False
     if before.low <= now.high and now.low <= before.high:
-        return f"within noise of {_value(before)}", False
+        return f"within noise of {percent_of(before)}", False
     change = now.value - before.value
     return (
         f"{'+' if change > 0 else MINUS}{number(abs(change), 1)} points · "
@@ -217,8 +198,8 @@ def since(before: Figure | None, now: Figure | Missing) -> tuple[str, bool]:
 
 def advice(sources: Sources, judged: Verdict) -> list[str]:
     """The identification's own sentences, then the remedies of rules that they do not speak of."""
-    advised = lookup(sources.metrics["identify_plant"], "advice")
-    sentences = [] if isinstance(advised, Missing) else [_sentence(text) for text in advised]
+    model = sources.metrics["identify_plant"]
+    sentences = [_sentence(text) for text in entry(model, "advice") or []]
     spoken = {"Inputs used up", "Whiteness", "Excitation"} if sentences else set()
     spoken |= {"Simulation"} if any("hold-out fit" in text for text in sentences) else set()
     sentences += [
@@ -226,12 +207,8 @@ def advice(sources: Sources, judged: Verdict) -> list[str]:
         for (rule,) in judged.rules
         if rule.state != PASSED and rule.remedy and rule.name not in spoken
     ]
-    notes = lookup(sources.metrics["identify_plant"], "notes")
-    return sentences + (
-        []
-        if isinstance(notes, Missing)
-        else [f"Noted while fitting: {text}." for text in dict.fromkeys(notes)]
-    )
+    notes = dict.fromkeys(entry(model, "notes") or [])
+    return [*sentences, *(f"Noted while fitting: {text}." for text in notes)]
 
 
 def _sentence(text: str) -> str:
@@ -242,11 +219,10 @@ def _sentence(text: str) -> str:
 # ---- tables
 
 
+@or_empty
 def candidates(sources: Sources) -> list[dict[str, Any]]:
     """The order table with its rule: what each order keeps, costs and leaves unexplained."""
-    table = sources.tables["order"]
-    if isinstance(table, Missing):
-        return []
+    table = need(sources.tables["order"])
     tried = np.isfinite(table["error"])
     chosen = int(table["order"][table["chosen"]][0]) if table["chosen"].any() else 0
     last = max(chosen + 3, int(table["order"][tried].max()) if tried.any() else 0)
@@ -274,16 +250,15 @@ def candidates(sources: Sources) -> list[dict[str, Any]]:
     return rows
 
 
+@as_table(rows=[])
 def losses(sources: Sources) -> dict[str, Any]:
     """For each signal: samples, how many are masked, and what was flagged."""
-    table = sources.tables["record"]
-    if isinstance(table, Missing):
-        return {"missing": table, "rows": []}
+    table = need(sources.tables["record"])
     flags = lookup(sources.metrics["ingest"], "findings")
     rows = []
     for signal in [*sources.declared.machine.inputs, *sources.declared.machine.outputs]:
         masked, total = int(table[f"{signal.name}_masked"].sum()), len(table["time_s"])
-        mine = {} if isinstance(flags, Missing) else flags.get(signal.name, {})
+        mine = known(flags, {}).get(signal.name, {})
         share = f" ({short(100 * masked / total, 2)}{THIN}%)" if masked else ""
         rows.append(
             {
@@ -292,10 +267,10 @@ def losses(sources: Sources) -> dict[str, Any]:
                 "masked": f"{number(masked, 0)}{share}",
                 "bad": masked > 0.1 * total,
                 "flags": ", ".join(f"{kind} {number(number_of, 0)}" for kind, number_of in mine.items())
-                or ("not measured" if isinstance(flags, Missing) else "none"),
+                or ("not measured" if gap_of(flags) else "none"),
             }
         )
-    return {"missing": None, "rows": rows}
+    return {"rows": rows}
 
 
 def used(sources: Sources) -> list[tuple[str, str]]:
@@ -313,19 +288,92 @@ def used(sources: Sources) -> list[tuple[str, str]]:
         (identified, "past", "Window, in samples"),
     )
     rows = [
-        (title, value.state if isinstance(value := lookup(data, key), Missing) else number(value, 0))
-        for data, key, title in items
+        (title, gap.state if (gap := gap_of(value)) else number(value, 0))
+        for value, title in ((lookup(data, key), title) for data, key, title in items)
     ]
-    delays = lookup(identified, "delays")
-    late = (
-        []
-        if isinstance(delays, Missing)
-        else [f"{name} {count(steps, 'sample')}" for name, steps in delays.items() if steps]
+    delays = entry(identified, "delays")
+    late = [f"{name} {count(steps, 'sample')}" for name, steps in (delays or {}).items() if steps]
+    none = "not measured" if delays is None else "none beyond one sample"
+    return [*rows, ("Dead time found", ", ".join(late) or none)]
+
+
+@as_table(sentences=[], rows=[])
+def next_experiment(sources: Sources) -> dict[str, Any]:
+    """Of the stage generate_probing."""
+    metrics = sources.metrics["generate_probing"]
+    told, added = need_figure(metrics, "next_experiment"), need_figure(metrics, "closed_loop")
+    if not told["written"]:
+        why = f"No experiment is written: {_celsius(told['reason'])}."
+        return {"sentences": [why, _around(added)], "rows": []}
+    return {
+        "sentences": [_played(told), _taught(told), _around(added)],
+        "rows": [
+            {
+                "output": output.name,
+                "target": _degrees(told["target_degC"].get(output.name)),
+                "forecast": _range(
+                    told["lowest_degC"].get(output.name), told["highest_degC"].get(output.name)
+                ),
+                "limits": _range(*(told["limit_degC"][output.name][end] for end in ("low", "high"))),
+            }
+            for output in sources.declared.machine.outputs
+            if output.name in told["limit_degC"]
+        ],
+    }
+
+
+def _played(told: Mapping[str, Any]) -> str:
+    least, most = (pick(told["amplitude_percent"].values()) for pick in (min, max))
+    moves = short(most, 2) if least == most else f"{short(least, 2)} to {short(most, 2)}"
+    doubt = told.get("doubt")
+    doubted = (
+        ""
+        if doubt is None
+        else f", though input gains be wrong by {100 * doubt['input_gain']:g}{THIN}% and the ambient by "
+        f"{doubt['ambient_degC']:g}{THIN}°C"
     )
-    return [
-        *rows,
-        (
-            "Dead time found",
-            ", ".join(late) or ("not measured" if isinstance(delays, Missing) else "none beyond one sample"),
-        ),
-    ]
+    return (
+        f"next_experiment.csv lasts {number(told['seconds'], 0)}{THIN}s, starts at the last recorded inputs, "
+        f"and moves each by {moves}{THIN}%. Every plant of the family stays within the limits{doubted}. "
+        "Start it only where the machine stands as the record left it, and stay beside it."
+    )
+
+
+def _taught(told: Mapping[str, Any]) -> str:
+    errors = [pair for pairs in told["expected_error_percent"].values() for pair in pairs.values()]
+    if not errors:
+        return "No pair of input and output is seen."
+    gain, pace = (max(pair[key] for pair in errors) for key in ("gain", "time_constant"))
+    return (
+        f"It would leave gains unknown by at most {short(gain, 2)}{THIN}% and time constants by "
+        f"{short(pace, 2)}{THIN}% (standard errors on first-order models, the worst of {len(errors)} pairs); "
+        f"rank {told['excitation_rank']} of {told['excitation_full_rank']}{_gap(told)}."
+    )
+
+
+def _gap(told: Mapping[str, Any]) -> str:
+    gap = told["expected_gap_percent"]
+    return "" if gap is None else f", expected gap of a controller {short(gap, 2)}{THIN}%"
+
+
+def _around(added: Mapping[str, Any]) -> str:
+    if not added["written"]:
+        return f"Nothing is written to add to a running controller: {_celsius(added['reason'])}."
+    return (
+        f"next_experiment_closed_loop.csv is to be added to the running controller's commands: up to "
+        f"{short(max(added['amplitude_percent'].values()), 2)}{THIN}%; around a PI the family stays between "
+        f"{short(min(added['lowest_degC'].values()), 3)} and "
+        f"{short(max(added['highest_degC'].values()), 3)}{THIN}°C."
+    )
+
+
+def _celsius(reason: str) -> str:
+    return reason.rstrip(".").replace(" degC", f"{THIN}°C")
+
+
+def _degrees(value: float | None) -> str:
+    return "" if value is None else short(value, 3)
+
+
+def _range(low: float | None, high: float | None) -> str:
+    return "" if low is None or high is None else f"{short(low, 3)} to {short(high, 3)}"

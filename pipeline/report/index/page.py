@@ -4,7 +4,7 @@ cost, what changed since the accepted run, what to do next, and which file to lo
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.report.about import changes
+from pipeline.report.about import page as about_page
 from pipeline.report.certificate import exported
 from pipeline.report.deposition import card as deposition_card
 from pipeline.report.setpoint import card as setpoint_card
@@ -14,14 +14,15 @@ from pipeline.report.shared.difference import accepted_on
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import card as temperature_card
 from pipeline.report.temperature.judgement import Judgement
-from pipeline.report.temperature.twelve import drift_state
-from pipeline.verdict.verdict import FAILED, PASSED, Missing, Verdict
+from pipeline.report.temperature.page import drift_state
+from pipeline.verdict.evidence import need, or_no_entries
+from pipeline.verdict.verdict import FAILED, PASSED, Verdict
 
 
 def render(sources: Sources, judged: Judgement) -> str:
     """The text of index.html."""
     loops, verdicts = headline.loops(sources), sources.verdicts
-    told = changes.changes(sources, judged)
+    told = about_page.changes(sources, judged)
     return page.render(
         "index.html",
         here="index",
@@ -58,11 +59,10 @@ def drifts(judged: Judgement) -> str:
     return f"Drift: temperature {word[:1].lower()}{word[1:].rstrip('.')}, not measured in the others."
 
 
+@or_no_entries
 def files(sources: Sources, verdict: Verdict) -> dict[str, dict[str, Any]]:
     """{loop: what leaves the house}; {} if nothing was exported."""
-    lines = exported.lines(sources, verdict)
-    if isinstance(lines, Missing):
-        return {}
+    lines = need(exported.lines(sources, verdict))
     return {
         line.loop: {
             "path": line.file,

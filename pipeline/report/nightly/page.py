@@ -272,8 +272,7 @@ def _rule(settings: Nightly) -> str:
 def _used(path: str, share: Mapping[str, float], night: Night) -> dict[str, str]:
     """How much of a new recording was used, and the smallest changes that it could have shown."""
     columns = {name: quantity(share[f"{name}_percent"], "%", 0) for name in ("used", "masked", "cut")}
-    least = night.drift.figures.get(path, {}).get("least", "")
-    return {"recording": path, **columns, "least": least}
+    return {"recording": path, **columns, "least": night.drift.figures.get(path, {}).get("least", "")}
 
 
 # ---- drift
@@ -289,23 +288,22 @@ def _drift(night: Night, settings: Nightly) -> dict[str, Any]:
          "bad": abs(change["percent"]) >= limit and abs(change["sigmas"]) >= settings.drift.watch_sigmas}
         for name, change in figures["parameters"].items()
     ]  # fmt: skip
-    innovation = [
-        {
-            "name": output,
-            "noise": quantity(errors["noise_percent"], "%", 0),
-            "noise_sigmas": number(errors["noise_sigmas"], 1),
-            "mean": beyond_meaning(errors["mean_degC"], "°C") or f"{short(errors['mean_degC'], 2)} °C",
-            "mean_sigmas": number(errors["mean_sigmas"], 1),
-        }
-        for output, errors in figures.get("innovation", {}).items()
-    ]
     changes = figures.get("closed_loop", {}).items()
     worst = sorted(((abs(one["sigmas"]), name, one["moved"], one["sigmas"]) for name, one in changes))[:-7:-1]
     return {
         "recording": path,
         "run": night.run,
         "rows": rows,
-        "innovation": innovation,
+        "innovation": [
+            {
+                "name": output,
+                "noise": quantity(errors["noise_percent"], "%", 0),
+                "noise_sigmas": number(errors["noise_sigmas"], 1),
+                "mean": beyond_meaning(errors["mean_degC"], "°C") or f"{short(errors['mean_degC'], 2)} °C",
+                "mean_sigmas": number(errors["mean_sigmas"], 1),
+            }
+            for output, errors in figures.get("innovation", {}).items()
+        ],
         "limit": f"{limit:g}",
         "not_applicable": figures.get("not_applicable", ""),
         "loop": [

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 
 from pipeline.papers import made
 from pipeline.report.papers import deposition, setpoint, study, temperature
-from pipeline.report.papers.relearned import sentences
 from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS, Paper, read
+from pipeline.report.papers.study import sentences
 from pipeline.report.shared import page
 from pipeline.report.shared.sources import Sources
 from pipeline.store import artifacts
@@ -37,14 +37,13 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
         if isinstance(paper, Missing):
             gaps.append((key, paper))
             continue
-        pictures = PICTURES[key](paper.results, sources)
         shown.append(
             {
                 "key": key,
                 "paper": paper,
                 "brief": brief(paper),
                 "rows": paper.rows,
-                "pictures": pictures,
+                "pictures": PICTURES[key](paper.results, sources),
                 "files": (printed, results),
                 "made": " ".join(
                     made.sentence(one) for one in (key, *filter(made.changed, PARTS.get(key, ())))
@@ -52,15 +51,6 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
             }
         )
     papers = [one["paper"] for one in shown]
-    counts = [
-        {
-            "key": paper.key,
-            "title": paper.title,
-            "rows": len(paper.rows),
-            "counts": [paper.count(verdict) for verdict in VERDICTS],
-        }
-        for paper in papers
-    ]
     return page.render(
         "papers.html",
         here="papers",
@@ -68,7 +58,15 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
         title="Three papers beside us",
         decision=decision(papers),
         verdicts=VERDICTS,
-        counts=counts,
+        counts=[
+            {
+                "key": paper.key,
+                "title": paper.title,
+                "rows": len(paper.rows),
+                "counts": [paper.count(verdict) for verdict in VERDICTS],
+            }
+            for paper in papers
+        ],
         papers=shown,
         gaps=gaps,
         state=GLYPHS,

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from pipeline.papers import made
 from pipeline.store import artifacts
 from pipeline.verdict.digits import number
+from pipeline.verdict.evidence import gap_of
 from pipeline.verdict.verdict import Missing
 
 HOLDS, SHAPE, FAILS, OPEN = "holds", "holds in shape", "does not hold", "cannot be judged"
@@ -125,8 +126,7 @@ def _ours(one: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) 
         return None
     several = isinstance(asked, list)
     values = [look_up(path, found, metrics, place) for path in (asked if several else [asked])]
-    gap = next((value for value in values if isinstance(value, Missing)), None)
-    if gap:
+    if gap := next(filter(None, map(gap_of, values)), None):
         return gap
     values = [value * scale if scale != 1 else value for value in values]
     return values if several else values[0]
@@ -141,7 +141,7 @@ def look_up(path: str, found: Mapping[str, Any], metrics: Mapping[str, Any], pla
     stage, *_ = keys = path.removeprefix("run:").split(".")
     value: Any = metrics if in_run else found
     for key in keys:
-        if isinstance(value, Missing):
+        if gap_of(value):
             return value
         try:
             value = value[int(key)] if isinstance(value, list) else value[key]
@@ -161,7 +161,7 @@ def look_up(path: str, found: Mapping[str, Any], metrics: Mapping[str, Any], pla
 def _verdict(one: Mapping[str, Any], ours: Any, entries: list[Entry]) -> str:
     """The verdict of a row by its rule."""
     rule, printed = one["rule"], one.get("printed")
-    if rule == "not_judged" or isinstance(ours, Missing) or not one.get("judged", True):
+    if rule == "not_judged" or gap_of(ours) or not one.get("judged", True):
         return OPEN
     if rule == "entries":
         agree = sum(entry.verdict == HOLDS for entry in entries)
@@ -214,7 +214,7 @@ def _text(value: Any, unit: str, places: int | None) -> str:
 
 def _shown(ours: Any, unit: str, places: int | None) -> str:
     """Ours as text. A small number keeps a digit, so that nothing reads as zero that is not."""
-    if isinstance(ours, Missing):
+    if gap_of(ours):
         return "not measured in this run"
     if isinstance(ours, float) and places is not None and 0 < abs(ours) < 0.5 * 10.0**-places:
         return f"below {number(10.0**-places, places)} {unit}".strip()

@@ -10,7 +10,7 @@ from pipeline.report.papers.figures import PaperCurve, PaperFigure, plane, plot
 from pipeline.report.shared import charts
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import number
-from pipeline.verdict.verdict import Missing
+from pipeline.verdict.evidence import known
 
 CLASSES = ("insufficient", "optimal", "excessive")
 FLOW, TEMPERATURE = charts.linear(0, 320), charts.linear(180, 240)
@@ -118,14 +118,13 @@ def _setpoints(run: Mapping[str, Any]) -> list[Markup]:
 def _way(run: Mapping[str, Any]) -> Markup:
     rings = [PaperCurve(*_ellipse(20.0, 10.0, scale), "ref") for scale in (1.0, 3.0)]
     frame_title = "temperature in °C, against flow in %"
-    way = PaperCurve(run["flow"], run["temperature"], "line")
     return plane(
         rings,
         title=frame_title,
         alt=f"The way ends at {number(run['flow'][-1], 0)} % and {number(run['temperature'][-1], 0)} °C",
         across=FLOW,
         up=TEMPERATURE,
-        way=way,
+        way=PaperCurve(run["flow"], run["temperature"], "line"),
     )
 
 
@@ -198,9 +197,9 @@ def _rewards(learning: Mapping[str, Any]) -> Markup:
 
 def _vision(sources: Sources) -> list[PaperFigure]:
     """Figure 5 (b, c) of the classifier of the last run."""
-    course, classified = sources.tables["course"], sources.tables["classified"]
+    course, classified = (known(sources.tables[name], None) for name in ("course", "classified"))
     out = []
-    if not isinstance(course, Missing) and len(course["epoch"]):
+    if course and len(course["epoch"]):
         mine = course["learner"] == "vision transformer"
         epochs, loss = course["epoch"][mine].tolist(), course["training_loss"][mine].tolist()
         right = course["held_out_accuracy"][mine]
@@ -225,7 +224,7 @@ def _vision(sources: Sources) -> list[PaperFigure]:
                 "Of the last run. Its loss has a part for the flow, too.",
             )
         )
-    if not isinstance(classified, Missing):
+    if classified:
         tables = (
             ("Named as, in per cent of the pictures of a class", _confusion(classified)),
             ("Named right, in per cent, by temperature", _by_temperature(classified)),

@@ -97,5 +97,10 @@ def _plot(shown: ReplayData, lines: Sequence[np.ndarray], name: str, unit: str) 
     layers += [
         charts.line(frame, time, line, css) for line, css in zip(lines, ("line", "lim line"), strict=False)
     ]
-    alt = f"{name} from {low:.4g} to {high:.4g} {unit}"
-    return charts.panel(frame, layers, alt=alt, title=f"{name} in {unit}", units=("s", unit))
+    return charts.panel(
+        frame,
+        layers,
+        alt=f"{name} from {low:.4g} to {high:.4g} {unit}",
+        title=f"{name} in {unit}",
+        units=("s", unit),
+    )

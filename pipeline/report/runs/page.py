@@ -5,9 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.report.about.changes import ANOTHER, changes
-from pipeline.report.runs.curves import READERS, Curve, curves, restored
-from pipeline.report.runs.figures import LOOPS, RunFigures, asked, measured
+from pipeline.report.about.page import ANOTHER, changes
+from pipeline.report.runs.figures import LOOPS, READERS, Curve, RunFigures, asked, curves, measured, restored
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.difference import accepted_on, changed_parameters, move
 from pipeline.report.shared.sources import Sources
@@ -62,13 +61,18 @@ def accepted(sources: Sources) -> Run | None:
     run = sources.accepted
     if not isinstance(run, dict):
         return None
-    report = {
-        "figures": run["figures"],
-        "verdict": {"winner": run["winner"]},
-        "verdicts": run.get("verdicts"),
-    }
     return Run(
-        "Accepted run", {**run["metrics"], "report": report}, run["params"], restored(run.get("curves"))
+        "Accepted run",
+        {
+            **run["metrics"],
+            "report": {
+                "figures": run["figures"],
+                "verdict": {"winner": run["winner"]},
+                "verdicts": run.get("verdicts"),
+            },
+        },
+        run["params"],
+        restored(run.get("curves")),
     )
 
 
@@ -105,7 +109,18 @@ def _parts(a: Run | None, b: Run, rules: ReportRules) -> dict[str, Any]:
         ]
         if another and loop == "temperature":
             rows = [row | {"change": "another machine", "moved": False} for row in rows]
-        loops.append((_head(loop, before, now), rows))
+        # by run whose figures they are, with the verdict
+        names = [run.controllers.get(loop) for run in (before, now)]
+        loops.append(
+            (
+                {
+                    "loop": loop,
+                    "who": [heading(name) if name else "" for name in names],
+                    "verdicts": [run.verdicts.get(loop, "") for run in (before, now)],
+                },
+                rows,
+            )
+        )
     differing = list(changed_parameters(a.parameters, b.parameters)) if a else []
     return {
         "names": (a.name if a else "Accepted run", b.name),
@@ -142,15 +157,6 @@ def _signals(run: Run) -> list[set]:
 # ---- figures
 
 
-def _head(loop: str, before: RunFigures, now: RunFigures) -> dict[str, Any]:
-    """A loop, and by run whose figures they are with the verdict."""
-    return {
-        "loop": loop,
-        "who": [heading(run.controllers[loop]) if run.controllers.get(loop) else "" for run in (before, now)],
-        "verdicts": [run.verdicts.get(loop, "") for run in (before, now)],
-    }
-
-
 def _row(question: Question, before: Figure | None, now: Figure | None) -> dict[str, Any]:
     bound = "at least" if question.at_least else "at most"
     limit = with_unit(question.limit, question.unit, declared(question.limit))
@@ -168,9 +174,12 @@ def _cell(question: Question, figure: Figure | None) -> dict[str, Any]:
     if figure is None:
         return {"text": "not measured", "band": "", "bad": False}
     places = row_places(question, [figure])
-    text = quantity(figure.value, question.unit, places, beyond=question.beyond)
     ends = band(figure.low, figure.high, places, beyond=question.beyond)
-    return {"text": text, "band": ends or "no band", "bad": state(question, figure) == FAILED}
+    return {
+        "text": quantity(figure.value, question.unit, places, beyond=question.beyond),
+        "band": ends or "no band",
+        "bad": state(question, figure) == FAILED,
+    }
 
 
 def _change(question: Question, before: Figure | None, now: Figure | None) -> tuple[str, bool]:
@@ -202,15 +211,17 @@ def _panel(name: str, before: Curve | None, now: Curve | None) -> dict[str, Any]
     frame = charts.Frame(charts.linear(float(x.min()), float(x.max())), _scale(y), 340, 140, 44, 30)
     across, up = drawn[-1][0][:2]
     ends = [f"{'accepted run' if 'dash' in css else 'this run'} {curve.y[-1]:g}" for curve, css in drawn]
-    svg = charts.panel(
-        frame,
-        [charts.line(frame, curve.x, curve.y, css) for curve, css in drawn],
-        alt=f"{name}, last value: {', '.join(ends)}",
-        css="mb wide",
-        title=f"{up}{', log' if frame.y.log else ''}",
-        across=across,
-    )
-    return {"title": name, "svg": svg}
+    return {
+        "title": name,
+        "svg": charts.panel(
+            frame,
+            [charts.line(frame, curve.x, curve.y, css) for curve, css in drawn],
+            alt=f"{name}, last value: {', '.join(ends)}",
+            css="mb wide",
+            title=f"{up}{', log' if frame.y.log else ''}",
+            across=across,
+        ),
+    }
 
 
 def _scale(values: np.ndarray) -> charts.Axis:

@@ -2,6 +2,7 @@
 default; and the cases of the rule that decides."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -11,23 +12,37 @@ from pipeline.report.shared import charts, page
 from pipeline.report.shared.card import (
     PICTURE,
     Card,
-    CardCell,
-    CardRow,
-    CardStep,
     Deciding,
-    Entrant,
     best_of,
+    cell,
+    entrant,
     in_order,
     of_verdict,
+    or_no_figures,
+    step,
 )
+from pipeline.report.shared.difference import Change
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import FLOW_BAND
 from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
-from pipeline.verdict.digits import THIN, band, count
-from pipeline.verdict.evidence import lookup
+from pipeline.verdict.digits import MINUS, THIN, band, count, number
+from pipeline.verdict.evidence import (
+    Absent,
+    entry,
+    gap_of,
+    instead,
+    known,
+    lookup,
+    need,
+    need_figure,
+    or_empty,
+    or_gap,
+    or_nothing,
+)
 from pipeline.verdict.setpoint import (
     Board,
     Case,
+    Cell,
     Harm,
     bars,
     board,
@@ -39,7 +54,7 @@ from pipeline.verdict.setpoint import (
     within,
     worst,
 )
-from pipeline.verdict.verdict import FAILED, PASSED, Figure, Missing, Verdict
+from pipeline.verdict.verdict import FAILED, PASSED, Figure, Missing, Question, Verdict, state
 
 MOVES = "Nozzle camera to setpoints"
 # cases that the picture has room for, the worst first
@@ -48,42 +63,34 @@ MOST_CASES = 8
 
 def card(sources: Sources, verdict: Verdict) -> Card:
     """Settling, staying and harm of the three."""
-    scores, step = board(sources.evidence, sources.subject("setpoint")), _step(sources, verdict)
-    if isinstance(scores, Missing) or not verdict.winner:
-        why = scores.sentence() if isinstance(scores, Missing) else verdict.reason
-        return of_verdict(
-            verdict,
-            MOVES,
-            step,
-            entrants=[],
-            rows=[],
-            basis="",
-            cost="",
-            picture=Missing("not measured", why),
-            sources=[],
-            missing=why,
-        )
+    return of_verdict(verdict, MOVES, _step(verdict), **_figures(sources, verdict))
+
+
+@or_no_figures
+def _figures(sources: Sources, verdict: Verdict) -> dict[str, Any]:
+    scores = need(board(sources.evidence, sources.subject("setpoint")))
+    if not verdict.winner:
+        raise Absent(Missing("not measured", verdict.reason))
     names, asked = shown(scores), sources.declared.rules
     limits = bars(sources.evidence, scores)
     harms = [harm_of(scores, name, limits) for name in names]
     limit = next((harm.limit for harm in harms if isinstance(harm, Harm)), None)
-    return of_verdict(
-        verdict,
-        MOVES,
-        step,
-        entrants=[Entrant(role(scores, name), name, scores.kinds[name]) for name in names],
-        rows=[
+    return {
+        "entrants": [entrant(role(scores, name), name, scores.kinds[name]) for name in names],
+        "rows": [
             _shares("Settles", scores, names, "settled", asked.settled_percent),
             _shares("Stays", scores, names, "stay", asked.stay_percent),
-            CardRow(
-                "Good prints moved", "" if limit is None else f"≤ {limit:g}{THIN}%", _harm_cells(harms, limit)
-            ),
+            {
+                "title": "Good prints moved",
+                "limit": "" if limit is None else f"≤ {limit:g}{THIN}%",
+                "cells": _harm_cells(harms, limit),
+            },
         ],
-        basis=f"Worst case; small: 95{THIN}% interval",
-        cost=_cost(sources),
-        picture=deciding(sources, verdict),
-        sources=sources.source("scoreboard"),
-    )
+        "basis": f"Worst case; small: 95{THIN}% interval",
+        "cost": _cost(sources),
+        "picture": deciding(sources, verdict),
+        "sources": sources.source("scoreboard"),
+    }
 
 
 def shown(scores: Board) -> list[str]:
@@ -96,66 +103,64 @@ def shown(scores: Board) -> list[str]:
     return list(in_order({name: scores.kinds[name] for name in of_kind.values()}))
 
 
+@or_nothing
 def _cost(sources: Sources) -> str:
     """Segments of prints and pictures that were learned from."""
-    data = lookup(sources.metrics["train_classifier"], "data")
-    if isinstance(data, Missing):
-        return ""
+    data = need_figure(sources.metrics["train_classifier"], "data")
     return f"{data['segments']:,} segments, {data['frames']:,} pictures"
 
 
-def _shares(title: str, scores: Board, names: Sequence[str], what: str, limit: float) -> CardRow:
+def _shares(title: str, scores: Board, names: Sequence[str], what: str, limit: float) -> dict[str, Any]:
     figures = [worst(scores, name, what)[0] for name in names]
     best = best_of([f.value if isinstance(f, Figure) else None for f in figures], at_least=True)
-    return CardRow(title, f"≥ {limit:g}{THIN}%", [_share(f, best, bad=_below(f, limit)) for f in figures])
+    return {
+        "title": title,
+        "limit": f"≥ {limit:g}{THIN}%",
+        "cells": [_share(f, best, bad=isinstance(f, Figure) and f.high < limit) for f in figures],
+    }
 
 
-def _below(figure: Figure | Missing, limit: float) -> bool:
-    return isinstance(figure, Figure) and figure.high < limit
+@instead(lambda gap: cell(gap.state))
+def _share(figure: Figure | Missing, best: float | None, *, bad: bool) -> dict[str, Any]:
+    share = need(figure)
+    return cell(share_text(share), band(share.low, share.high, 1), best=share.value == best, bad=bad)
 
 
-def _share(figure: Figure | Missing, best: float | None, *, bad: bool) -> CardCell:
-    if isinstance(figure, Missing):
-        return CardCell(figure.state)
-    return CardCell(share_text(figure), band(figure.low, figure.high, 1), figure.value == best, bad)
-
-
-def _harm_cells(harms: Sequence[Harm | Missing], limit: float | None) -> list[CardCell]:
+def _harm_cells(harms: Sequence[Harm | Missing], limit: float | None) -> list[dict[str, Any]]:
     """The harm of each in the case that decides for it; where another limit holds in that case, with it."""
     best = best_of([h.figure.value if isinstance(h, Harm) else None for h in harms], at_least=False)
     cells = []
     for harm in harms:
-        if isinstance(harm, Missing):
-            cells.append(CardCell(harm.state))
+        if not isinstance(harm, Harm):
+            cells.append(cell(harm.state))
             continue
-        cell = _share(harm.figure, best, bad=harm.state == FAILED)
+        share = _share(harm.figure, best, bad=harm.state == FAILED)
         own = "" if harm.limit == limit else f"; ≤ {harm.limit:g}{THIN}%"
-        cells.append(cell._replace(band=cell.band + own))
+        cells.append(share | {"band": share["band"] + own})
     return cells
 
 
-def _step(sources: Sources, verdict: Verdict) -> CardStep:
+def _step(verdict: Verdict) -> dict[str, str]:
     if not verdict.winner:
-        return CardStep("Run the stages of this loop.", "./run dvc repro evaluate_setpoint")
+        return step("Run the stages of this loop.", "./run dvc repro evaluate_setpoint")
     if verdict.rehearsal:
-        return CardStep(
+        return step(
             "Film the training print; frames go to datasets/raw/setpoint.",
             "./run beadline training-print training.gcode",
         )
     if verdict.state == PASSED:
-        return CardStep("Watch a print without steering it.", "./run beadline shadow FRAMES")
-    return CardStep(f"{verdict.remedy.split('To try: ')[-1].split('. ')[0].rstrip('.')}.", "./run dvc repro")
+        return step("Watch a print without steering it.", "./run beadline shadow FRAMES")
+    return step(f"{verdict.remedy.split('To try: ')[-1].split('. ')[0].rstrip('.')}.", "./run dvc repro")
 
 
 # ---- the cases of the rule that decides
 
 
+@or_gap
 def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     """The case that decides, decision by decision; where its runs were not kept, runs that settle, or settle
     and stay, in every case that counts, the worst first. Of the three of the card."""
-    scores = board(sources.evidence, sources.subject("setpoint"))
-    if isinstance(scores, Missing):
-        return scores
+    scores = need(board(sources.evidence, sources.subject("setpoint")))
     if not scores.default:
         return Missing("not measured", "No controller was chosen")
     stays, asked = verdict.rule.startswith("Stays"), sources.declared.rules
@@ -168,10 +173,10 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
         return Missing("not measured", "no case counts")
     first, more = cases[0], len(cases) - MOST_CASES
     listed = ", ".join(f"{name} {_text(scores, name, first, what)}" for name in names)
-    entrants = [Entrant(role(scores, name), name, "") for name in names]
+    entrants = [entrant(role(scores, name), name) for name in names]
     low, high = deciding_case.MIDDLE
     traced = deciding_case.panel(sources, scores, first, names)
-    if not isinstance(traced, Missing):
+    if not gap_of(traced):
         return Deciding(
             f"Runs that {does} in {within(first)}: {listed}.",
             traced,
@@ -241,3 +246,39 @@ def _lane(frame: charts.Frame, at: float, figure: Figure, css: str) -> Markup:
         css, low, high, y, y
     )
     return Markup("{}{}").format(bar, charts.mark(css, f"{middle:.1f}", y))
+
+
+# points closer than this are one: the accepted figures are kept rounded
+SAME = 0.05
+
+
+def change(sources: Sources, case: Case, cell: Cell | None) -> Change:
+    """How the settled runs of the default moved since the accepted run: beyond noise where the
+    interval of the one and as wide a one about the other do not overlap."""
+    if not known(sources.accepted, None) or cell is None or not isinstance(cell.settled, Figure):
+        return Change("first run")
+    stage = lookup(sources.accepted, "metrics.evaluate_setpoint")
+    before = entry(stage, str(entry(stage, "default")), *case, "settled")
+    if before is None:
+        return Change("new")
+    now = cell.settled
+    points = now.value - before
+    if abs(points) < SAME:
+        return Change("unchanged")
+    # the accepted figure has the interval of today's: of as many runs, clustered as they are
+    if now.low <= before + now.high - now.value and before - (now.value - now.low) <= now.high:
+        return Change("within noise")
+    question = Question(0, "", "Settled", "%", sources.declared.rules.settled_percent, True, "")
+    text = (
+        f"{'+' if points > 0 else MINUS}{number(abs(points), 1)}{THIN}points · "
+        f"{'better' if points > 0 else 'worse'}"
+    )
+    return Change(text, moved=True, worse=points < 0 and state(question, now) == FAILED)
+
+
+@or_empty
+def changes(sources: Sources) -> list[tuple[str, Change]]:
+    """Every case of the default that counts, with how its settled runs moved."""
+    scores = need(board(sources.evidence, sources.subject("setpoint")))
+    counting = scores.counting(scores.default) if scores.default else []
+    return [(within(case), change(sources, case, cell)) for case, cell in counting]

@@ -9,13 +9,13 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.card import PICTURE
-from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND
 from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 from pipeline.verdict.digits import THIN, count, number, shortened
-from pipeline.verdict.evidence import Table
+from pipeline.verdict.evidence import Absent, Table, need, or_gap
 from pipeline.verdict.setpoint import Board, Case, case_text, role, worst
 from pipeline.verdict.verdict import Missing
 
@@ -28,7 +28,6 @@ MIDDLE = (10, 90)
 ROUNDING = 1e-3
 # width, height and the room left, below, above and right of a panel, in px
 SIZE = (568, 300, 34, 20, 22, 12)
-STYLES = {"dd": "line dd", "mb": "line", "bl": "line bl"}
 
 
 class Trace(NamedTuple):
@@ -64,17 +63,13 @@ def trace(table: Table, case: Case, name: str) -> Trace | None:
         return None
     order = np.lexsort((table["step"][mine], table["start"][mine]))
     cuts = np.flatnonzero(np.diff(table["start"][mine][order])) + 1
-    flow, temperature = (
-        _equally_long(np.split(table[column][mine][order], cuts))
-        for column in ("flow_percent", "temperature_degC")
-    )
+    runs = {
+        column: np.split(table[column][mine][order], cuts) for column in ("flow_percent", "temperature_degC")
+    }
+    flow, temperature = (np.stack([run[: min(map(len, each))] for run in each]) for each in runs.values())
     inside = np.abs(flow - BEST_FLOW) <= FLOW_BAND + ROUNDING
     inside &= np.abs(temperature - BEST_TEMPERATURE) <= TEMPERATURE_BAND + ROUNDING
     return Trace(flow, inside)
-
-
-def _equally_long(runs: Sequence[np.ndarray]) -> np.ndarray:
-    return np.stack([run[: min(map(len, runs))] for run in runs])
 
 
 def clog(table: Table, case: Case) -> Clog | None:
@@ -89,10 +84,10 @@ def clog(table: Table, case: Case) -> Clog | None:
     return Clog(int(moved[0]) + 1, 100.0 * float(np.median(left[:, moved[0]])))
 
 
+@or_gap
 def traces(table: Table | Missing, case: Case, names: Sequence[str]) -> Traces | Missing:
     """The runs of these controllers in this case, of the first of them at least; why there are none."""
-    if isinstance(table, Missing):
-        return table
+    table = need(table)
     kept = {name: trace(table, case, name) for name in names}
     found = {name: one for name, one in kept.items() if one is not None}
     if names[0] not in found:
@@ -107,23 +102,19 @@ def shown(board: Board) -> list[str]:
     return list(dict.fromkeys((board.default, *others[:1], DOES_NOTHING)))
 
 
+@as_picture("deciding", TITLE)
 def picture(sources: Sources, board: Board | Missing) -> Picture:
     """Flow against decisions in the default's worst case, and the share of the runs that are inside."""
-    if isinstance(board, Missing):
-        return placeholder("deciding", TITLE, board)
+    board = need(board)
     _, case = worst(board, board.default, "lasting")
     if case is None:
-        return placeholder("deciding", TITLE, Missing("not measured", "no controller was chosen"))
-    found = traces(sources.tables["paths"], case, shown(board))
-    if isinstance(found, Missing):
-        return placeholder("deciding", TITLE, found)
+        raise Absent(Missing("not measured", "no controller was chosen"))
+    found = need(traces(sources.tables["paths"], case, shown(board)))
     told = finding(found)
     flow = _flow(board, found, charts.Frame(_decisions(found), FLOW, *SIZE), alt=told)
     share = _inside(board, found, sources.declared.rules.settled_percent)
     starts = count(len(found.runs[board.default].flow), "start")
     return Picture(
-        "deciding",
-        case_text(case, whole=True),
         told,
         [
             PictureColumn("Flow", "per cent, against decisions", "", [flow]),
@@ -134,14 +125,14 @@ def picture(sources: Sources, board: Board | Missing) -> Picture:
         f"{BEST_TEMPERATURE:g}{THIN}±{THIN}{TEMPERATURE_BAND:g}{THIN}°C. What lies beyond the axis is not "
         "drawn.",
         page.origin(sources.source("paths"), simulator=case[0], case=case[1], controller=list(found.runs)),
+        title=case_text(case, whole=True),
     )
 
 
+@or_gap
 def panel(sources: Sources, board: Board, case: Case, names: Sequence[str]) -> Markup | Missing:
     """The flow of these controllers in a case, as page one draws it; why there is none."""
-    found = traces(sources.tables["paths"], case, names)
-    if isinstance(found, Missing):
-        return found
+    found = need(traces(sources.tables["paths"], case, names))
     frame = charts.Frame(_decisions(found), FLOW, *PICTURE, 34, 34, 16, 14)
     return _flow(board, found, frame, alt=finding(found), page_one=True)
 
@@ -179,7 +170,7 @@ def _flow(board: Board, found: Traces, frame: charts.Frame, *, alt: str, page_on
     """Median and middle of the runs of everybody who acts, and each run that is left alone. On page one the
     marks stand below the picture."""
     layers: list[Markup] = []
-    styles = _styles(board, found)
+    styles = page.line_styles({name: role(board, name) for name in found.runs})
     # what is left alone lies behind, the default in front
     for name in reversed(list(found.runs)):
         flow = found.runs[name].flow
@@ -215,23 +206,20 @@ def _inside(board: Board, found: Traces, limit: float) -> Markup:
     y = charts.Axis(0, 104, tuple((float(v), str(v)) for v in (0, 25, 50, 75, 100)))
     frame = charts.Frame(_decisions(found), y, *SIZE)
     layers = [charts.level(frame, limit, "lim", f"to settle: {limit:g}", above=False)]
-    styles, ends = _styles(board, found), []
+    styles, ends = page.line_styles({name: role(board, name) for name in found.runs}), []
     for name in reversed(list(found.runs)):
         share = 100 * found.runs[name].inside.mean(axis=0)
         layers.append(charts.line(frame, *corners(share), styles[name], steps=True))
         ends.append(f"{name} {number(float(share[-1]), 0)} %")
     layers += [*_event(frame, found.clog), *_key(frame, board, found)]
-    alt = f"Runs inside at the end: {', '.join(ends[::-1])}; {limit:g} % are to settle"
-    return charts.panel(frame, layers, alt=alt, css="mb wide", title="inside, %", units=("decisions", "%"))
-
-
-def _styles(board: Board, found: Traces) -> dict[str, str]:
-    """A line each; the second of a hue is dashed."""
-    styles: dict[str, str] = {}
-    for name in found.runs:
-        style = STYLES[page.MARKS[role(board, name)]]
-        styles[name] = f"{style} dash" if style in styles.values() else style
-    return styles
+    return charts.panel(
+        frame,
+        layers,
+        alt=f"Runs inside at the end: {', '.join(ends[::-1])}; {limit:g} % are to settle",
+        css="mb wide",
+        title="inside, %",
+        units=("decisions", "%"),
+    )
 
 
 def _event(frame: charts.Frame, happens: Clog | None) -> list[Markup]:

@@ -1,21 +1,19 @@
 """The page of the setpoint loop: who sets flow and temperature by default, what each controller makes of each
 case, and what the camera's classifier is worth."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 from pipeline.report.deposition.page import flat
 from pipeline.report.setpoint import agent as setpoint_agent
-from pipeline.report.setpoint import by_flow as setpoint_by_flow
-from pipeline.report.setpoint import change as setpoint_change
+from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.setpoint import deciding as setpoint_deciding
-from pipeline.report.setpoint import harm as setpoint_harm
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import BEYOND
 from pipeline.verdict.digits import THIN, band, number, percent, quantity
-from pipeline.verdict.evidence import lookup
+from pipeline.verdict.evidence import gap_of, known, lookup, need, need_figure, or_nothing
 from pipeline.verdict.setpoint import (
     DATA_DRIVEN,
     MODEL_BASED,
@@ -71,7 +69,7 @@ LANES = {"data_driven": "dd", "model_based": "mb", "baseline": "acc"}
 def render(sources: Sources) -> str:
     """The text of setpoint.html."""
     judged, scores = sources.verdicts["setpoint"], board(sources.evidence, sources.subject("setpoint"))
-    judged_scores = None if isinstance(scores, Missing) else scores
+    judged_scores = known(scores, None)
     claimed = setpoint_agent.claims(sources)
     return page.render(
         "setpoint.html",
@@ -93,25 +91,26 @@ def render(sources: Sources) -> str:
         and bool(judged_scores.default)
         and judged_scores.kinds[judged_scores.default] != DATA_DRIVEN,
         summary=summary(sources.evidence, judged_scores) if judged_scores and judged_scores.default else "",
-        no_board=scores if isinstance(scores, Missing) else None,
+        no_board=gap_of(scores),
         heads=heads(judged_scores),
         answers=answers(sources, judged_scores) if judged_scores else [],
-        better=_better(judged_scores) if judged_scores else 0,
+        # cases that the first screen has no room for: those in which the default fares best
+        better=max(len(_counting(judged_scores)) - MOST, 0) if judged_scores else 0,
         deciding=setpoint_deciding.picture(sources, scores),
         boards=boards(sources, judged_scores) if judged_scores else [],
         worsts=worsts(judged_scores) if judged_scores else [],
-        harms=setpoint_harm.harms(sources, scores),
+        harms=setpoint_agent.harms(sources, scores),
         why_default=choice_sentence(sources),
         ways=setpoint_agent.ways(sources, scores),
         strips=setpoint_why.strips(sources),
         training=setpoint_agent.training(sources),
         phases=setpoint_agent.phases(sources),
-        claims=[] if isinstance(claimed, Missing) else claimed,
-        claims_missing=claimed if isinstance(claimed, Missing) else None,
+        claims=known(claimed, []),
+        claims_missing=gap_of(claimed),
         guesses=setpoint_agent.guesses(sources),
         agent_made=setpoint_agent.kept_sentence(),
         good_named=good_named(sources),
-        by_flow=setpoint_by_flow.by_flow(sources),
+        by_flow=setpoint_vision.by_flow(sources),
         yardsticks=setpoint_vision.yardsticks(sources),
         reliability=setpoint_vision.reliability(sources),
         confusion=setpoint_vision.confusion(sources),
@@ -127,23 +126,22 @@ def render(sources: Sources) -> str:
     )
 
 
+@or_nothing
 def good_named(sources: Sources) -> str:
     """How many frames of good prints the classifier names good."""
-    table = sources.tables["classified"]
-    if isinstance(table, Missing):
-        return ""
+    table = need(sources.tables["classified"])
     right = table["named"][table["label"] == GOOD] == GOOD
     if not len(right):
         return ""
     return f"Of {len(right):,} frames of good prints {percent(100 * float(right.mean()), 2)} are named good."
 
 
+@or_nothing
 def choice_sentence(sources: Sources) -> str:
     """Why the default is the default, as the stage that chose it says, and who may not run."""
-    said, refused = (lookup(sources.tables["choice"], key) for key in ("sentence", "refused"))
-    if isinstance(said, Missing):
-        return ""
-    barred = [] if isinstance(refused, Missing) else [f"{name} {why}." for name, why in refused.items()]
+    said = need_figure(sources.tables["choice"], "sentence")
+    refused = known(lookup(sources.tables["choice"], "refused"), {})
+    barred = [f"{name} {why}." for name, why in refused.items()]
     return " ".join([str(said), *(["May not run:"] if barred else []), *barred]).replace("+-", "±")
 
 
@@ -193,9 +191,9 @@ def answers(sources: Sources, scores: Board) -> list[dict[str, Any]]:
                     for name, cell, css in zip(pair, cells, ("dd", "mb"), strict=True)
                 ],
                 "strip": charts.strip(lost, shown),
-                "stay": _stay(own),
+                "stay": share_text(own.stay) if own else "not measured",
                 "stay_bad": states[1] == FAILED,
-                "change": setpoint_change.change(sources, case, own),
+                "change": setpoint_card.change(sources, case, own),
                 "decides": case == lowest,
             }
         )
@@ -212,11 +210,6 @@ def _counting(scores: Board) -> list[Case]:
     ]
 
 
-def _better(scores: Board) -> int:
-    """Cases that the first screen has no room for: those in which the default fares best."""
-    return max(len(_counting(scores)) - MOST, 0)
-
-
 def _share_of(cell: Cell | None) -> float:
     """The share by which a case is read; 101 where it was not run."""
     share = Missing("not measured", "") if cell is None else lasting(cell)
@@ -225,15 +218,12 @@ def _share_of(cell: Cell | None) -> float:
 
 def _lost(cell: Cell | None, what: str = "settled") -> Figure | Missing:
     share = Missing("not measured", "this case was not run") if cell is None else getattr(cell, what)
-    return (
-        share
-        if isinstance(share, Missing)
-        else Figure(*(max(100 - end, 0.0) for end in (share.value, share.high, share.low)))
-    )
+    ends = () if gap_of(share) else (share.value, share.high, share.low)
+    return gap_of(share) or Figure(*(max(100 - end, 0.0) for end in ends))
 
 
 def _reading(name: str, cell: Cell | None, lost: Question, css: str) -> dict[str, Any]:
-    if cell is None or isinstance(cell.settled, Missing):
+    if cell is None or not isinstance(cell.settled, Figure):
         return {"css": css, "name": name, "value": "not measured", "band": "", "bad": False}
     interval = band(cell.settled.low, cell.settled.high, 1)
     return {
@@ -245,21 +235,7 @@ def _reading(name: str, cell: Cell | None, lost: Question, css: str) -> dict[str
     }
 
 
-def _stay(cell: Cell | None) -> str:
-    return "not measured" if cell is None else share_text(cell.stay)
-
-
 # ---- the scoreboard
-
-
-class BoardCell(NamedTuple):
-    """One controller in one case, in words; bold in its own worst case."""
-
-    lines: list[dict[str, Any]]
-    steps: str = ""
-    more: str = ""
-    tip: str = ""
-    bold: bool = False
 
 
 def boards(sources: Sources, scores: Board) -> list[dict[str, Any]]:
@@ -293,19 +269,19 @@ def boards(sources: Sources, scores: Board) -> list[dict[str, Any]]:
 def _row(scores: Board, name: str, cases: list[Case], limits: dict[str, float]) -> dict[str, Any]:
     """One controller's row in the cases of one simulator."""
     _, lowest = worst(scores, name, "lasting")
-    cells = [_cell(scores.cells.get((name, case)), limits, bold=case == lowest) for case in cases]
     return {
         "name": name,
         "mark": role(scores, name),
         "default": name == scores.default,
         "kind": scores.kinds[name],
-        "cells": cells,
+        "cells": [_cell(scores.cells.get((name, case)), limits, bold=case == lowest) for case in cases],
     }
 
 
-def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> BoardCell:
+def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> dict[str, Any]:
+    """One controller in one case, in words; bold in its own worst case."""
     if cell is None:
-        return BoardCell([])
+        return {"lines": [], "steps": "", "more": "", "tip": "", "bold": False}
     lines = []
     for what, word in (("settled", ""), ("stay", "stay "), ("recovered", "recover ")):
         share = getattr(cell, what)
@@ -325,8 +301,13 @@ def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> BoardCe
     more = f"past it {number(cell.overshoot, 0)}{THIN}%" if cell.overshoot == cell.overshoot else ""
     more += f", off {number(cell.flow_error, 1)}{THIN}%" if cell.flow_error == cell.flow_error else ""
     flow, degrees, share = cell.worst_start
-    tip = f"{cell.runs:,} runs; fewest settle from {flow:g} % and {degrees:g} °C: {number(share, 0)} %"
-    return BoardCell(lines, steps, more.strip(", "), tip, bold)
+    return {
+        "lines": lines,
+        "steps": steps,
+        "more": more.strip(", "),
+        "tip": f"{cell.runs:,} runs; fewest settle from {flow:g} % and {degrees:g} °C: {number(share, 0)} %",
+        "bold": bold,
+    }
 
 
 def _worth(cell: Cell, what: str, share: Figure) -> str:

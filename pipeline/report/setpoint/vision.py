@@ -2,6 +2,7 @@
 training, frames with key areas, what was held and foreign."""
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,12 +10,23 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.pictures import Picture, PictureColumn, placeholder
+from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table, placeholder
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.published import ALPHA
 from pipeline.verdict.digits import THIN, band, number, percent, quantity, short
-from pipeline.verdict.evidence import Table, lookup
-from pipeline.verdict.setpoint import CLASS_BORDERS, accuracy, share_text
+from pipeline.verdict.evidence import (
+    Absent,
+    Table,
+    entry,
+    gap_of,
+    instead,
+    known,
+    lookup,
+    need,
+    need_figure,
+    or_empty,
+)
+from pipeline.verdict.setpoint import CLASS_BORDERS, accuracy, share_in, share_text
 from pipeline.verdict.verdict import Figure, Missing
 
 CLASSES = ("under", "good", "over")
@@ -29,34 +41,30 @@ DIAGRAMS = (
 )
 
 
+@as_picture("reliability", "When it says 80 %, is it right in 80 %?")
 def reliability(sources: Sources) -> Picture:
     """Share that is right against the confidence that was stated, before and after calibration."""
-    table, metrics = sources.tables["reliability"], sources.metrics["train_classifier"]
-    title = "When it says 80 %, is it right in 80 %?"
-    if isinstance(table, Missing):
-        return placeholder("reliability", title, table)
-    errors = [lookup(metrics, key) for *_, key in DIAGRAMS]
+    table, metrics = need(sources.tables["reliability"]), sources.metrics["train_classifier"]
+    errors = [entry(metrics, key) for *_, key in DIAGRAMS]
     columns = []
     for (of, method, head, small, _), error in zip(DIAGRAMS, errors, strict=True):
         mine = (table["of"] == of) & (table["method"] == method) & (table["count"] > 0)
         if mine.any():
-            words = "not measured" if isinstance(error, Missing) else f"off by {number(error, 3)} on average"
+            words = "not measured" if error is None else f"off by {number(error, 3)} on average"
             bins = {name: table[name][mine] for name in ("confidence", "accuracy", "count")}
             panel = _diagram(bins, head, of, words, title="" if columns else "share right")
         else:
             gap = Missing("not measured", f"no diagram of {method}")
-            panel = Markup('<div class="hole">{}</div>').format(page.missing(gap))
+            panel = page.hole(gap)
         columns.append(PictureColumn(head, small, "", [panel]))
     text = (
         "Some of the calibration errors were not measured."
-        if any(isinstance(value, Missing) for value in errors)
+        if None in errors
         else f"Calibration takes the error of an image from {number(errors[0], 3)} to "
         f"{number(errors[1], 3)}, and of a window from {number(errors[2], 3)} (counting classes, as "
         f"published) to {number(errors[3], 3)}."
     )
     return Picture(
-        "reliability",
-        title,
         text,
         columns,
         "Share of answers that are right, against the confidence stated with them; dashed: as "
@@ -81,15 +89,20 @@ def _diagram(bins: Table, head: str, of: str, words: str, *, title: str) -> Mark
         for a, b, k in zip(x, y, n, strict=True)
     ]
     layers.append(charts.label(frame, 1.0, 0.04, words, anchor="end"))
-    alt = f"{head}: stated and true share of right answers are {words}, over {int(n.sum())} {of}s"
-    return charts.panel(frame, layers, alt=alt, css="dd", title=title, units=("stated", "right"))
+    return charts.panel(
+        frame,
+        layers,
+        alt=f"{head}: stated and true share of right answers are {words}, over {int(n.sum())} {of}s",
+        css="dd",
+        title=title,
+        units=("stated", "right"),
+    )
 
 
+@as_picture("confusion", "What is taken for what, by temperature")
 def confusion(sources: Sources) -> Picture:
     """True class against the class named, by temperature (figure 5c)."""
-    table, title = sources.tables["classified"], "What is taken for what, by temperature"
-    if isinstance(table, Missing):
-        return placeholder("confusion", title, table)
+    table = need(sources.tables["classified"])
     columns, right, swapped = [], {}, 0
     for degrees in np.unique(np.round(table["temperature_degC"] / 10) * 10)[:7]:
         mine = np.abs(table["temperature_degC"] - degrees) <= 5
@@ -114,8 +127,6 @@ def confusion(sources: Sources) -> Picture:
         "errors sit at the borders of the classes."
     )
     return Picture(
-        "confusion",
-        title,
         text,
         columns,
         (
@@ -160,19 +171,14 @@ def _matrix(counts: np.ndarray, degrees: float) -> Markup:
 # ---- windows
 
 
+@as_picture("distributions", "What a window says, by true flow")
 def distributions(sources: Sources) -> Picture:
     """The scaled distribution (4) by true flow: of recorded windows,
     and as the paper's simulator draws it (figure 4)."""
-    table, title = sources.tables["windows"], "What a window says, by true flow"
-    if isinstance(table, Missing):
-        return placeholder("distributions", title, table)
+    table = need(sources.tables["windows"])
     mine = {name: values[table["part"] == "judge"] for name, values in table.items()}
     if not len(mine["flow_bin"]):
-        return placeholder(
-            "distributions",
-            title,
-            Missing("not measured", "no window to judge by", "Run ./run dvc repro train_classifier"),
-        )
+        raise Absent(Missing("not measured", "no window to judge by", "Run ./run dvc repro train_classifier"))
     flow, scaled, right = _by_bin(mine)
     high = min(float(mine["flow_high_percent"].max()), 320.0)
     frame = charts.Frame(
@@ -208,8 +214,6 @@ def distributions(sources: Sources) -> Picture:
     ]
     rest = float(np.mean(np.delete(right, worst))) if len(right) > 1 else float(right[0])
     return Picture(
-        "distributions",
-        title,
         f"Between {places[worst]} of flow only {number(float(right[worst]), 0)}{THIN}% of the "
         f"windows are named rightly, elsewhere {number(rest, 0)}{THIN}% on average: what the "
         "paper’s simulator draws does not know this.",
@@ -231,8 +235,14 @@ def _scaled_shares(frame: charts.Frame, head: str, x: np.ndarray, y: np.ndarray,
     layers = [_good(frame)]
     layers += [charts.line(frame, x, y[:, k], f"line {css}") for k, css in enumerate(("brown", "", "green"))]
     spread = float(np.sort(y, axis=1)[:, -2].max())
-    alt = f"{head}: the second largest class reaches {number(spread, 2)} of the largest"
-    return charts.panel(frame, layers, alt=alt, css="mb", title=title, units=("%", ""))
+    return charts.panel(
+        frame,
+        layers,
+        alt=f"{head}: the second largest class reaches {number(spread, 2)} of the largest",
+        css="mb",
+        title=title,
+        units=("%", ""),
+    )
 
 
 def _right(frame: charts.Frame, flow: np.ndarray, right: np.ndarray, place: str) -> Markup:
@@ -243,8 +253,15 @@ def _right(frame: charts.Frame, flow: np.ndarray, right: np.ndarray, place: str)
         charts.line(frame, flow, right),
         charts.dots(frame, flow, right, "dot whole dd", 2.4),
     ]
-    alt = f"Windows are named rightly in {number(float(right.min()), 0)} % at worst, between {place} of flow"
-    return charts.panel(frame, layers, alt=alt, css="dd", title="%", units=("%", "%"))
+    return charts.panel(
+        frame,
+        layers,
+        alt=f"Windows are named rightly in {number(float(right.min()), 0)} % at worst, between {place} of "
+        "flow",
+        css="dd",
+        title="%",
+        units=("%", "%"),
+    )
 
 
 def _good(frame: charts.Frame) -> Markup:
@@ -272,33 +289,29 @@ def _by_bin(mine: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 # ---- training
 
 
+@as_picture("course", "The classifier in training")
 def learning_curves(sources: Sources) -> Picture:
     """Loss and accuracy of both networks, epoch by epoch (figure 5b)."""
-    table, metrics = sources.tables["course"], sources.metrics["train_classifier"]
-    title = "The classifier in training"
-    if isinstance(table, Missing):
-        return placeholder("course", title, table)
+    table, metrics = need(sources.tables["course"]), sources.metrics["train_classifier"]
     if not len(table["epoch"]):
         gap = Missing("not applicable", "few own pictures train no network: only its last layer was fitted")
-        return placeholder("course", title, gap)
+        raise Absent(gap)
     svc, limit = accuracy(metrics, "svc_image"), 100 * sources.declared.rules.image_accuracy
     columns, sentences = [], []
     for name, rows in pd.DataFrame(table).groupby("learner", sort=False):
         learner, mine = str(name), {str(column): values.to_numpy() for column, values in rows.items()}
         x = charts.linear(0, max(float(mine["epoch"].max()), 1.0), ticks=5)
-        best = lookup(metrics, f"best_epoch.{learner}")
+        best = entry(metrics, "best_epoch", learner)
         share = 100 * mine["held_out_accuracy"]
         highest = float(np.nanmax(share)) if np.isfinite(share).any() else math.nan
         sentences.append(
             f"{learner} {number(highest, 1)}{THIN}% at best"
-            + ("" if isinstance(best, Missing) else f", epoch {best} kept")
+            + ("" if best is None else f", epoch {best} kept")
         )
         alt = f"{learner}: {number(highest, 1)} % of the watched images are named rightly at best"
         panels = [_losses(learner, mine, x), _accuracies(mine["epoch"], share, x, limit, svc, alt)]
         columns.append(PictureColumn(learner[:1].upper() + learner[1:], "", "", panels))
     return Picture(
-        "course",
-        title,
         f"On segments that are only watched: {'; '.join(sentences)}.",
         columns,
         "Mean cross entropy above, share of images named rightly below, against epochs. Grey line: "
@@ -322,12 +335,15 @@ def _losses(learner: str, mine: Table, x: charts.Axis) -> Markup:
         for name, values, dy in (("learned from", training, 12), ("only watched", held_out, -5))
         if math.isfinite(values[-1])
     ]
-    alt = (
-        f"{learner}: the loss on segments that are only watched is least, "
-        f"{number(float(held_out[least]), 2)}, after {int(mine['epoch'][least])} epochs"
-    )
     return charts.panel(
-        frame, layers, alt=alt, css="dd wide", title="loss", x_ticks=False, units=("epochs", "")
+        frame,
+        layers,
+        alt=f"{learner}: the loss on segments that are only watched is least, "
+        f"{number(float(held_out[least]), 2)}, after {int(mine['epoch'][least])} epochs",
+        css="dd wide",
+        title="loss",
+        x_ticks=False,
+        units=("epochs", ""),
     )
 
 
@@ -349,26 +365,16 @@ def _accuracies(
 # ---- tables and frames
 
 
-class Foreign(NamedTuple):
-    """How one kind of foreign picture was detected, in words."""
-
-    kind: str
-    auroc: str
-    detected: str
-    alarms: str
-
-
+@as_table()
 def yardsticks(sources: Sources) -> dict[str, Any]:
     """The transformer beside the simpler ways, an image and a window."""
-    metrics = sources.metrics["train_classifier"]
-    if isinstance(metrics, Missing):
-        return {"missing": metrics}
+    metrics = need(sources.metrics["train_classifier"])
     rows = []
     for name, head in (
         ("", "Vision transformer"),
         *((key, text[:1].upper() + text[1:]) for key, text in NAMES.items()),
     ):
-        if isinstance(accuracy(metrics, f"{name}_image".strip("_")), Missing):
+        if gap_of(accuracy(metrics, f"{name}_image".strip("_"))):
             continue  # of few own pictures no other way is learned
         cells = []
         # of windows of all flows none is asked: the rule asks for 70 to 150 %
@@ -383,48 +389,38 @@ def yardsticks(sources: Sources) -> dict[str, Any]:
             )
         rows.append({"name": head, "mark": "baseline" if name else "data_driven", "cells": cells})
     said = lookup(metrics, "proof.verdict")
-    proof = said.sentence() if isinstance(said, Missing) else f"The classifier: {said}."
-    foreign = lookup(metrics, "out_of_distribution")
-    return {"missing": None, "rows": rows, "proof": proof, "foreign": _foreign(foreign)}
+    proof = gap.sentence() if (gap := gap_of(said)) else f"The classifier: {said}."
+    return {"rows": rows, "proof": proof, "foreign": _foreign(metrics)}
 
 
-def _foreign(detection: Any) -> list[Foreign]:
-    """A row for each kind of foreign picture."""
-    if isinstance(detection, Missing):
-        return []
-    rows = []
-    for kind, figures in detection.items():
-        if isinstance(figures, dict) and "auroc" in figures:
-            alarms = figures.get("false_alarms", detection.get("false_alarms"))
-            area, found = _area(figures["auroc"]), _share(figures.get("found"))
-            rows.append(Foreign(str(kind), area, found, _share(alarms)))
-    return rows
+@or_empty
+def _foreign(metrics: Any) -> list[dict[str, str]]:
+    """How each kind of foreign picture was detected."""
+    detection = need_figure(metrics, "out_of_distribution")
+    return [
+        {
+            "kind": str(kind),
+            "auroc": "not measured" if figures["auroc"] is None else number(float(figures["auroc"]), 3),
+            "detected": _share(figures.get("found")),
+            "alarms": _share(figures.get("false_alarms", detection.get("false_alarms"))),
+        }
+        for kind, figures in detection.items()
+        if isinstance(figures, dict) and "auroc" in figures
+    ]
 
 
 def _share(value: float | None) -> str:
     return "not measured" if value is None else percent(100 * value, 2)
 
 
-def _area(value: float | None) -> str:
-    return "not measured" if value is None else number(float(value), 3)
-
-
+@instead(lambda gap: [("Frames", gap.sentence())])
 def data(sources: Sources) -> list[tuple[str, str]]:
     """What was shown to it: frames, rejections by reason, segments."""
     metrics = sources.metrics["train_classifier"]
-    counts = lookup(metrics, "data")
-    if isinstance(counts, Missing):
-        return [("Frames", counts.sentence())]
+    counts = need_figure(metrics, "data")
     frames, valid = counts.get("frames"), counts.get("valid")
     rejected = counts.get("rejected") or {}
-    rows = [
-        (
-            "Source",
-            str(lookup(metrics, "source"))
-            if not isinstance(lookup(metrics, "source"), Missing)
-            else "not said",
-        )
-    ]
+    rows = [("Source", str(entry(metrics, "source") or "not said"))]
     rows += (
         [("Frames", f"{frames:,}, of which {valid:,} ({percent(100 * valid / frames, 3)}) show a fresh line")]
         if frames and valid is not None
@@ -433,13 +429,8 @@ def data(sources: Sources) -> list[tuple[str, str]]:
     if isinstance(rejected, dict):
         rows += [("Rejected", ", ".join(f"{reason} {n:,}" for reason, n in rejected.items()) or "none")]
     rows += [("Segments", f"{counts['segments']:,}")] if isinstance(counts.get("segments"), int) else []
-    size, n = lookup(metrics, "size"), lookup(metrics, "parameters")
-    rows += (
-        [("Classifier", f"{size}, {n:,} parameters")]
-        if not isinstance(n, Missing) and not isinstance(size, Missing)
-        else []
-    )
-    return rows
+    size, n = entry(metrics, "size"), entry(metrics, "parameters")
+    return rows + ([("Classifier", f"{size}, {n:,} parameters")] if size and n else [])
 
 
 # kinds of real frames in the order of the page
@@ -455,18 +446,16 @@ RECORDED = (
 )
 
 
+@as_table(lead="")
 def frames(sources: Sources) -> dict[str, Any]:
     """Frames with key area and direction drawn in, of a rejected one the reason; where the classifier learned
     from recordings real ones: accepted, wrong, rejected and foreign, each with its share."""
-    index = sources.tables["nozzle_frames"]
-    if isinstance(index, Missing):
-        return {"missing": index, "lead": ""}
+    index = need(sources.tables["nozzle_frames"])
     table: list[Any] = list(index)
     recorded = [row for row in table if row.get("group") in GROUPS]
     origin = page.origin(sources.source("nozzle_frames"))
     if not recorded:
         return {
-            "missing": None,
             "groups": [{"head": "", "share": "", "shown": [_frame(row) for row in table]}],
             "lead": RENDERED,
             "origin": origin,
@@ -477,7 +466,7 @@ def frames(sources: Sources) -> dict[str, Any]:
         share = percent(100 * mine[0]["share"], 2) if mine and mine[0].get("share") is not None else ""
         if mine:
             groups.append({"head": head, "share": share, "shown": [_frame(row) for row in mine]})
-    return {"missing": None, "groups": groups, "lead": RECORDED, "origin": origin}
+    return {"groups": groups, "lead": RECORDED, "origin": origin}
 
 
 def _frame(row: dict[str, Any]) -> dict[str, Any]:
@@ -513,3 +502,167 @@ def _frame(row: dict[str, Any]) -> dict[str, Any]:
         "foot": ", ".join(filter(None, (place, score, source))),
         "alt": f"Frame {row['file']}: {state}",
     }
+
+
+BY_FLOW = "Named rightly, by flow"
+# An ideal reader of the width that a rendered bead was drawn with: per cent of 960 new segments of 20 frames,
+# flow uniform over 70-150 %, by the lower edge of each bin of 5 %. Each segment carries a width bias of 5 %,
+# one draw, and each frame one of 8 % more, which no picture undoes.
+WIDTH_BIAS, IDEAL = 5.0, 88.0
+IDEAL_BY_BIN = dict(
+    zip(
+        np.arange(70.0, 150.0, 5.0),
+        (100, 99, 92, 65, 68, 89, 86, 62, 67, 87, 96, 99, 100, 100, 100, 100),
+        strict=True,
+    )
+)
+
+
+class Bin(NamedTuple):
+    """A bin of true flow in percent: how often its windows are right, what the ideal reader reaches there
+    (NaN where nobody knows), and whether a border of the classes is one of its ends."""
+
+    low: float
+    high: float
+    windows: int
+    right: Figure
+    ideal: float
+    beside: bool
+
+
+def bins(metrics: Mapping | Missing) -> list[Bin]:
+    """Of train_classifier.json, the bin that is right least often first."""
+    found = need_figure(metrics, "by_flow")
+    rendered = lookup(metrics, "source") == "simulated"
+    rows = [
+        Bin(
+            row["flow_low"],
+            row["flow_high"],
+            row["windows"],
+            figure,
+            IDEAL_BY_BIN.get(row["flow_low"], float("nan")) if rendered else float("nan"),
+            any(border in CLASS_BORDERS for border in (row["flow_low"], row["flow_high"])),
+        )
+        for row in found
+        if (figure := share_in(row)) is not None
+    ]
+    rows.sort(key=lambda row: row.right.value)
+    if not rows:
+        raise Absent(Missing("not measured", "no bin of flow holds a window"))
+    return rows
+
+
+def place(row: Bin) -> str:
+    return f"{row.low:g}–{row.high:g}{THIN}%"
+
+
+@instead(lambda gap: {"picture": placeholder("by-flow", BY_FLOW, gap), "rows": (), "ideal": False})
+def by_flow(sources: Sources) -> dict[str, Any]:
+    """The chart, and its bins as a table, the worst first."""
+    metrics = sources.metrics["train_classifier"]
+    found = bins(metrics)
+    ideal = any(row.ideal == row.ideal for row in found)
+    caption = (
+        f"Bars: windows named rightly, by bins of 5{THIN}% of true flow; strokes: their 95{THIN}% intervals, "
+        "by segment. Pale: a bin beside a border of the classes. Segments that nothing was learned, "
+        "calibrated or chosen on."
+    )
+    if ideal:
+        caption += (
+            f" Dashed: an ideal reader of the drawn width, {number(IDEAL, 1)}{THIN}% over all bins: every "
+            f"segment carries a width bias of {WIDTH_BIAS:g}{THIN}%, which no picture tells from flow."
+        )
+    return {
+        "picture": Picture(
+            finding(found, known(lookup(metrics, "right_70_150"), None)),
+            [PictureColumn("Windows named rightly", "in per cent, by true flow", "", [_chart(found)])],
+            caption,
+            page.origin(sources.source("train_classifier")),
+            "by-flow",
+            BY_FLOW,
+        ),
+        "rows": [
+            {
+                "place": place(row),
+                "beside": row.beside,
+                "right": quantity(row.right.value, "%", 0),
+                "band": band(row.right.low, row.right.high, 0),
+                "ideal": number(row.ideal, 0) if row.ideal == row.ideal else "not known",
+                "windows": f"{row.windows:,}",
+            }
+            for row in found
+        ],
+        "ideal": ideal,
+    }
+
+
+def finding(rows: Sequence[Bin], every: Any) -> str:
+    """The worst bin, the worst away from the borders, and all as if as frequent."""
+    text = _worst("Worst bin: ", rows[0])
+    away = [row for row in rows if not row.beside]
+    if rows[0].beside and away:
+        text += " It lies beside a border of the classes. " + _worst("Worst away from the borders: ", away[0])
+    if share := share_in(every):
+        text += (
+            f" Were every flow from 70 to 150{THIN}% as frequent: {quantity(share.value, '%', 1)} "
+            f"({band(share.low, share.high, 1)})"
+        )
+        text += f"; the ideal reader {quantity(IDEAL, '%', 1)}." if rows[0].ideal == rows[0].ideal else "."
+    return text
+
+
+def _worst(head: str, row: Bin) -> str:
+    ideal = (
+        f"; the ideal reader reaches {quantity(row.ideal, '%', 0)} there" if row.ideal == row.ideal else ""
+    )
+    return (
+        f"{head}{place(row)} of flow, {quantity(row.right.value, '%', 0)} right{_interval(row.right)}, "
+        f"{row.windows:,} windows{ideal}."
+    )
+
+
+def _interval(figure: Figure) -> str:
+    words = band(figure.low, figure.high, 0)
+    return f" ({words})" if words else ""
+
+
+def _chart(rows: Sequence[Bin]) -> Markup:
+    """Bars with intervals, and the ideal reader as steps."""
+    rows = sorted(rows)
+    x = charts.Axis(rows[0].low, rows[-1].high, tuple((v, f"{v:g}") for v in _ticks(rows)))
+    y = charts.Axis(0, 104, tuple((float(v), str(v)) for v in (0, 25, 50, 75, 100)))
+    frame = charts.Frame(x, y, 568, 380, 42, 20, 24)
+    layers = []
+    for row in rows:
+        a, b = (float(v) for v in frame.px([row.low, row.high]))
+        top, low, high = (float(v) for v in frame.py([row.right.value, row.right.low, row.right.high]))
+        base, middle = frame.height - frame.below, (a + b) / 2
+        layers.append(
+            Markup(
+                '<rect class="bin{}" x="{:.1f}" width="{:.1f}" y="{:.1f}" height="{:.1f}"/>'
+                '<line class="whisk" x1="{:.1f}" x2="{:.1f}" y1="{:.1f}" y2="{:.1f}"/>'
+            ).format(
+                " beside" if row.beside else "", a + 1, max(b - a - 2, 1), top, max(base - top, 0),
+                middle, middle, high, low,
+            )
+        )  # fmt: skip
+    edges = np.array([edge for row in rows for edge in (row.low, row.high)])
+    ideal = np.repeat([row.ideal for row in rows], 2)
+    if np.isfinite(ideal).any():
+        layers.append(charts.line(frame, edges, ideal, "ref"))
+    least = min(rows, key=lambda row: row.right.value)
+    return charts.panel(
+        frame,
+        layers,
+        alt=f"Windows are named rightly least often between {least.low:g} and {least.high:g} % of flow, "
+        f"{number(least.right.value, 0)} %",
+        css="dd wide big",
+        title="% of windows, against % of flow",
+        units=("%", "%"),
+    )
+
+
+def _ticks(rows: Sequence[Bin]) -> list[float]:
+    """Every second edge, so that both borders are among them."""
+    edges = [row.low for row in rows] + [rows[-1].high]
+    return [edge for edge in edges if edge % 10 == 0]

@@ -9,11 +9,12 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
+from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import FLOW_BAND, TEMPERATURE_BAND
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 from pipeline.verdict.digits import THIN, count, number
-from pipeline.verdict.evidence import Table
+from pipeline.verdict.evidence import Table, need
 from pipeline.verdict.verdict import Missing
 
 EPISODES, WIDTH, LEFT = 2, 1112, 36
@@ -21,19 +22,6 @@ EPISODES, WIDTH, LEFT = 2, 1112, 36
 MOST_SENTENCES = 200
 # colours of the deposition page: too little, right, too much
 SHARES = (("p_under", "too-little"), ("p_good", "flag"), ("p_over", "too-much"))
-
-
-class Strip(NamedTuple):
-    """One episode: its name, its finding, its panels, and its decisions in words, of which `more` are not
-    shown."""
-
-    id: str
-    head: str
-    controller: str
-    finding: str
-    panels: list[Markup]
-    rows: list[str]
-    more: int
 
 
 class Held(NamedTuple):
@@ -44,11 +32,10 @@ class Held(NamedTuple):
     reason: str
 
 
+@as_table()
 def strips(sources: Sources) -> dict[str, Any]:
     """The episodes in the order of the table."""
-    table = sources.tables["decisions"]
-    if isinstance(table, Missing):
-        return {"missing": table}
+    table = need(sources.tables["decisions"])
     episodes = itertools.islice(pd.DataFrame(table).groupby("episode", sort=False), EPISODES)
     shown = [
         _strip({str(column): values.to_numpy() for column, values in rows.items()}, str(name), i)
@@ -67,7 +54,9 @@ def reason(why: str) -> str:
     return why.rsplit("held: ", 1)[-1].strip()
 
 
-def _strip(mine: Table, name: str, i: int) -> Strip:
+def _strip(mine: Table, name: str, i: int) -> dict[str, Any]:
+    """One episode: its name, its finding, its panels, and its decisions in words, of which `more` are not
+    shown."""
     t = mine["time_s"]
     edges = np.append(t, t[-1] + (t[-1] - t[-2] if len(t) > 1 else 1.0))
     x = charts.linear(float(t[0]), float(edges[-1]), ticks=10)
@@ -91,15 +80,15 @@ def _strip(mine: Table, name: str, i: int) -> Strip:
     moved = (mine["flow_move_percent"] != 0) | (mine["temperature_move_degC"] != 0)
     sentences = [str(text) for text in mine["why"][moved | mine["held"]]]
     panels = [_shares(mine, x, edges, held), _flow(mine, x, held, edges), _temperature(mine, x)]
-    return Strip(
-        f"why-{i}",
-        name,
-        str(mine["controller"][0]),
-        finding,
-        [*panels, _moves(mine, x)],
-        sentences[:MOST_SENTENCES],
-        len(sentences[MOST_SENTENCES:]),
-    )
+    return {
+        "id": f"why-{i}",
+        "head": name,
+        "controller": str(mine["controller"][0]),
+        "finding": finding,
+        "panels": [*panels, _moves(mine, x)],
+        "rows": sentences[:MOST_SENTENCES],
+        "more": len(sentences[MOST_SENTENCES:]),
+    }
 
 
 def _alike(mine: Table) -> list[tuple[int, int]]:
@@ -131,16 +120,13 @@ def _shares(mine: Table, x: charts.Axis, edges: np.ndarray, held: list[Held]) ->
         layers.append(Markup('<path class="{}" d="{}"/>').format(css, boxes))
         low = low + mine[column]
     layers += [_hatch(frame, float(px[stretch.begin]), float(px[stretch.end])) for stretch in held]
-    alt = (
-        f"Shares of under, good and over-extruded over {len(low)} windows: "
-        f"under peaks at {number(float(mine['p_under'].max()), 2)}, "
-        f"over at {number(float(mine['p_over'].max()), 2)}; "
-        f"{sum(stretch.end - stretch.begin for stretch in held)} windows were held"
-    )
     return charts.panel(
         frame,
         layers,
-        alt=alt,
+        alt=f"Shares of under, good and over-extruded over {len(low)} windows: "
+        f"under peaks at {number(float(mine['p_under'].max()), 2)}, "
+        f"over at {number(float(mine['p_over'].max()), 2)}; "
+        f"{sum(stretch.end - stretch.begin for stretch in held)} windows were held",
         css="mb strip-why",
         title="share of under (brown), good (grey), over (green); hatched: nothing may be sent",
         x_ticks=False,
@@ -181,16 +167,13 @@ def _flow(mine: Table, x: charts.Axis, held: list[Held], edges: np.ndarray) -> M
             Markup('<text x="{:.1f}" y="{}">{}</text>').format(start, frame.above + 9, f"held: {text}")
         )
         free = start + 6.2 * (len(text) + 8)
-    alt = (
-        f"True flow from {number(float(mine['flow_percent'][0]), 0)} to "
-        f"{number(float(mine['flow_percent'][-1]), 0)} %, between "
-        f"{number(float(mine['flow_percent'].min()), 0)} and "
-        f"{number(float(mine['flow_percent'].max()), 0)} %"
-    )
     return charts.panel(
         frame,
         layers,
-        alt=alt,
+        alt=f"True flow from {number(float(mine['flow_percent'][0]), 0)} to "
+        f"{number(float(mine['flow_percent'][-1]), 0)} %, between "
+        f"{number(float(mine['flow_percent'].min()), 0)} and "
+        f"{number(float(mine['flow_percent'].max()), 0)} %",
         css="dd strip-why",
         title="true flow, % (dashed: setpoint; grey: what is asked for)",
         x_ticks=False,
@@ -208,14 +191,11 @@ def _temperature(mine: Table, x: charts.Axis) -> Markup:
         charts.line(frame, mine["time_s"], mine["target_degC"], "ref", steps=True),
         charts.line(frame, mine["time_s"], mine["temperature_degC"]),
     ]
-    alt = (
-        f"Nozzle temperature from {number(float(mine['temperature_degC'][0]), 0)} to "
-        f"{number(float(mine['temperature_degC'][-1]), 0)} °C"
-    )
     return charts.panel(
         frame,
         layers,
-        alt=alt,
+        alt=f"Nozzle temperature from {number(float(mine['temperature_degC'][0]), 0)} to "
+        f"{number(float(mine['temperature_degC'][-1]), 0)} °C",
         css="dd strip-why",
         title="nozzle, °C (dashed: target)",
         x_ticks=False,
@@ -252,11 +232,11 @@ def _moves(mine: Table, x: charts.Axis) -> Markup:
                 f"{'+' if move > 0 else '−'}{number(abs(move), 0)} °C",
             )
         )
-    alt = f"{int(np.isfinite(moves).sum())} moves of the flow setpoint, {len(warm)} of the target temperature"
     return charts.panel(
         frame,
         layers,
-        alt=alt,
+        alt=f"{int(np.isfinite(moves).sum())} moves of the flow setpoint, {len(warm)} of the target "
+        "temperature",
         css="dd strip-why",
         title="moves that were sent: flow, points (strokes); target (lines with their °C)",
         units=("s", "points"),

@@ -7,43 +7,29 @@ from typing import Any, NamedTuple
 
 from markupsafe import Markup
 
-from pipeline.report.shared.sources import SourceFile
-from pipeline.verdict.verdict import Missing, Verdict
+from pipeline.verdict.evidence import instead
+from pipeline.verdict.verdict import Verdict
 
 # letters of a reason that a card has room for in the widest font
 ROOM = 200
 
 
-class Entrant(NamedTuple):
+Card = dict[str, Any]
+
+
+def entrant(mark: str, name: str, note: str = "") -> dict[str, str]:
     """A controller above its column: its mark, its name, and what it is here (named, runs now, yardstick)."""
-
-    mark: str
-    name: str
-    note: str
+    return {"mark": mark, "name": name, "note": note}
 
 
-class CardCell(NamedTuple):
+def cell(text: str, band: str = "", *, best: bool = False, bad: bool = False) -> dict[str, Any]:
     """A figure with its band in words; `best` of its row, `bad` where it failed."""
-
-    text: str
-    band: str = ""
-    best: bool = False
-    bad: bool = False
+    return {"text": text, "band": band, "best": best, "bad": bad}
 
 
-class CardRow(NamedTuple):
-    """One figure of every controller of the card, and the rule's limit."""
-
-    title: str
-    limit: str
-    cells: Sequence[CardCell]
-
-
-class CardStep(NamedTuple):
+def step(sentence: str, command: str) -> dict[str, str]:
     """What to do next: a sentence, and the command."""
-
-    sentence: str
-    command: str
+    return {"sentence": sentence, "command": command}
 
 
 # width and height of a card's picture, px
@@ -58,28 +44,7 @@ class Deciding(NamedTuple):
     drawn: Markup
     key: str
     origin: Markup
-    entrants: Sequence[Entrant] = ()
-
-
-class Card(NamedTuple):
-    """One loop. `basis` says what the small figures are; `picture` is the case that decides, or why there is
-    none; `cost` is what the data cost; `missing` says why there are no figures."""
-
-    loop: str
-    moves: str
-    state: str
-    decision: str
-    lead: str
-    reason: str
-    entrants: Sequence[Entrant]
-    rows: Sequence[CardRow]
-    basis: str
-    answer: str
-    cost: str
-    picture: Deciding | Missing
-    step: CardStep
-    sources: Sequence[SourceFile]
-    missing: str = ""
+    entrants: Sequence[dict[str, str]] = ()
 
 
 NEXT = re.compile(r"(?<=[.!?]) (?=[A-Z])")
@@ -93,19 +58,24 @@ def first_sentence(text: str, room: int = ROOM) -> str:
     return sentence if len(sentence) <= room else sentence[: room - 1].rstrip() + "…"
 
 
-def of_verdict(verdict: Verdict, moves: str, step: CardStep, **rest: Any) -> Card:
-    """The card of a loop with this verdict."""
-    return Card(
-        verdict.loop,
-        moves,
-        verdict.word,
-        verdict.decision,
-        verdict.lead,
-        first_sentence(verdict.reason),
-        answer=verdict.short_answer,
-        step=step,
-        **rest,
-    )
+def of_verdict(verdict: Verdict, moves: str, step: dict[str, str], **rest: Any) -> Card:
+    """The card of a loop with this verdict. `rest`: its entrants and rows; `basis` says what the small
+    figures are; `picture` is the case that decides, or why there is none; `cost` is what the data cost;
+    `sources`; or `missing`, why there are no figures."""
+    return {
+        "loop": verdict.loop,
+        "moves": moves,
+        "state": verdict.word,
+        "decision": verdict.decision,
+        "lead": verdict.lead,
+        "reason": first_sentence(verdict.reason),
+        "answer": verdict.short_answer,
+        "step": step,
+        "missing": "",
+    } | rest
+
+
+or_no_figures = instead(lambda gap: {"missing": gap.sentence()})
 
 
 def best_of(values: Sequence[float | None], *, at_least: bool) -> float | None:

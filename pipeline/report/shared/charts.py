@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.verdict.digits import number
+from pipeline.verdict.digits import number, power_of_ten
 from pipeline.verdict.verdict import FAILED, Figure, Missing, Question, share, state
 
 
@@ -137,11 +137,7 @@ def logarithmic(low: float, high: float, *, every: int = 0) -> Axis:
 
 
 def _power(k: int) -> str:
-    return (
-        number(10.0**k, max(-k, 0))
-        if -3 <= k <= 4
-        else "10" + str(k).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    )
+    return number(10.0**k, max(-k, 0)) if -3 <= k <= 4 else power_of_ten(k)
 
 
 class Frame(NamedTuple):
@@ -239,6 +235,14 @@ def readable(frame: Frame, units: tuple[str, str] = ("", "")) -> Markup:
 
 
 # ---- layers
+
+CIRCLE = np.stack([of(np.linspace(0, 2 * np.pi, 181)) for of in (np.cos, np.sin)])  # the unit circle
+
+
+def inside(frame: Frame, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those of the points that lie on the panel."""
+    seen = (x >= frame.x.low) & (x <= frame.x.high) & (y >= frame.y.low) & (y <= frame.y.high)
+    return x[seen], y[seen]
 
 
 def decimated(x: np.ndarray, y: np.ndarray, most: int = 240) -> tuple[np.ndarray, np.ndarray]:

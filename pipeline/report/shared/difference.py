@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from pipeline.report.shared.sources import Sources, digest
 from pipeline.verdict.digits import MINUS, THIN, beyond_meaning, count, decimals, number, short
+from pipeline.verdict.evidence import known
 from pipeline.verdict.verdict import Figure, Missing, Question
 
 
@@ -71,8 +72,8 @@ def accepted_on(sources: Sources) -> str:
 
 def difference(sources: Sources) -> Difference | None:
     """None where no run was accepted yet."""
-    before = sources.accepted
-    if before is None or isinstance(before, Missing):
+    before = known(sources.accepted, None)
+    if before is None:
         return None
     hashes = before.get("hashes") or {}
     now = {path: source.sha256 for path, source in sources.read.items() if path.startswith("datasets/")}

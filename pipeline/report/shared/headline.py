@@ -8,8 +8,8 @@ import numpy as np
 
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict import loops as verdict_loops
-from pipeline.verdict.digits import count, shortened
-from pipeline.verdict.verdict import Missing
+from pipeline.verdict.digits import count, listed, shortened
+from pipeline.verdict.evidence import known
 
 NAMES = ("temperature", "deposition", "setpoint")
 MOVES = ("heaters to barrel", "plunger to flow", "camera to setpoints")
@@ -66,7 +66,7 @@ def claim(sources: Sources, names: Sequence[str] = NAMES) -> str:
     made = [name for name in names if simulated(sources, name)]
     claims = [f"{name} {RECORDED[name]}" for name in names if name not in made]
     if made:
-        which = "" if len(names) == len(made) else f"{_listed(made, 'and')} "
+        which = "" if len(names) == len(made) else f"{listed(made)} "
         claims.append(
             f"{which}judged on simulated machines only: nothing is claimed about a real printer".strip()
         )
@@ -79,11 +79,11 @@ def data(sources: Sources, names: Sequence[str]) -> str:
     made = [name for name in names if simulated(sources, name)]
     if len(made) == len(names):
         return "Simulated machines; no recording was read."
-    table = sources.tables["record"]
-    read = [] if isinstance(table, Missing) or not sources.recorded else list(np.unique(table["recording"]))
-    listed = ", ".join(shortened(str(name), 40) for name in read[:2])
+    table = known(sources.tables["record"], None) if sources.recorded else None
+    read = list(np.unique(table["recording"])) if table else []
+    first = ", ".join(shortened(str(name), 40) for name in read[:2])
     more = f" and {len(read) - 2} more" if len(read) > 2 else ""
-    told = {"temperature": f"temperature {count(len(read), 'recording')} ({listed}{more})" if read else ""}
+    told = {"temperature": f"temperature {count(len(read), 'recording')} ({first}{more})" if read else ""}
     theirs = [
         told.get(name) or f"{name} recordings of datasets/raw/{name}" for name in names if name not in made
     ]
@@ -118,16 +118,12 @@ def decision(loops: Sequence[Loop], *, quick: bool = False) -> str:
         if names:
             kind = next(kind for kind in KINDS if kind in words)
             again = any(kind in part for part in parts)
-            listed = "all three loops" if len(names) == len(NAMES) else _listed(names, "and")
-            parts.append(f"{words.replace(kind, '') if again else words}: {listed}")
+            which = "all three loops" if len(names) == len(NAMES) else listed(names)
+            parts.append(f"{words.replace(kind, '') if again else words}: {which}")
     absent = [loop.name for loop in loops if loop.state == ABSENT]
-    parts += [f"not measured: {_listed(absent, 'and')}"] if absent else []
+    parts += [f"not measured: {listed(absent)}"] if absent else []
     text = "; ".join(parts)
     return f"{text[:1].upper()}{text[1:]}."
-
-
-def _listed(names: Sequence[str], word: str) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {word} {names[-1]}"
 
 
 def state(loops: Sequence[Loop]) -> str:

@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import re
 import urllib.parse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jinja2
 from markupsafe import Markup, escape
@@ -135,6 +135,19 @@ def mark(controller: str) -> Markup:
     return Markup('<span class="mk {}" aria-hidden="true"></span>').format(css)
 
 
+STYLES = {"dd": "line dd", "mb": "line", "bl": "line bl"}
+
+
+def line_styles(marks: Mapping[str, str]) -> dict[str, str]:
+    """{controller: the class of its line}, from the role or the name that has its mark; the second of a hue
+    is dashed."""
+    styles: dict[str, str] = {}
+    for name, role in marks.items():
+        style = STYLES.get(MARKS.get(role, "bl"), "line")
+        styles[name] = f"{style} dash" if style in styles.values() else style
+    return styles
+
+
 def bdi(text: object) -> Markup:
     """Text that came with the data: escaped, isolated, short; the whole of it in its title."""
     whole = " ".join(str(text).split())
@@ -148,6 +161,11 @@ def missing(gap: Missing) -> Markup:
     return Markup("{}<strong>{}.</strong> <bdi>{}</bdi>").format(
         glyph(gap.state), gap.state.capitalize(), gap.sentence()
     )
+
+
+def hole(gap: Missing) -> Markup:
+    """The same in the place of a panel."""
+    return Markup('<div class="hole">{}</div>').format(missing(gap))
 
 
 # sources that the viewer shows by the same name; a test holds them against its tables

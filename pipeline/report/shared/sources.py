@@ -28,7 +28,7 @@ from pipeline.temperature import tables as schemas
 from pipeline.temperature.settings import Plant
 from pipeline.verdict import night
 from pipeline.verdict.deposition import of_recorded_trials
-from pipeline.verdict.evidence import OFF, Evidence, Table, switched_off
+from pipeline.verdict.evidence import OFF, Evidence, Table, need, or_gap, switched_off
 from pipeline.verdict.settings import QUICK_LOOK, ReportRules
 from pipeline.verdict.verdict import LOOPS, Missing, Verdict, read_certificates
 from pipeline.verdict.verdict import read as read_verdicts
@@ -200,10 +200,10 @@ def collect(
     )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
     read = linked(read)
-    stored = read_verdicts(verdicts, (*LOOPS, "identification"))
     return Sources(
         declared, figures, tables, read, absent, before, folders_of_code, night,
-        quick=artifacts.exists(QUICK_LOOK), stored=stored, certified=read_certificates(verdicts),
+        quick=artifacts.exists(QUICK_LOOK), stored=read_verdicts(verdicts, (*LOOPS, "identification")),
+        certified=read_certificates(verdicts),
     )  # fmt: skip
 
 
@@ -324,10 +324,10 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
     ]
 
 
+@or_gap
 def first_routine(table: Table | Missing) -> Table | Missing:
     """The rows of each material's first recorded routine, the reference if that is recorded."""
-    if isinstance(table, Missing):
-        return table
+    table = need(table)
     if not len(table["routine"]):
         return Missing("not measured", "no trial is recorded yet")
     first = pd.Series(table["routine"]).groupby(np.asarray(table["material"])).transform("min")

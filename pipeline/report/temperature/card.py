@@ -3,32 +3,23 @@ that the verdict is about among them; and the case that decides."""
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.card import (
-    PICTURE,
-    Card,
-    CardCell,
-    CardRow,
-    CardStep,
-    Deciding,
-    Entrant,
-    in_order,
-    of_verdict,
-)
+from pipeline.report.shared.card import PICTURE, Card, Deciding, cell, entrant, in_order, of_verdict, step
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature.deciding import runs_of, until_settled
 from pipeline.report.temperature.judgement import Judgement, named_before
+from pipeline.report.temperature.pictures import runs_of, until_settled
 from pipeline.temperature.controllers.table import BY_NAME
 from pipeline.verdict.controllers import heading
-from pipeline.verdict.digits import THIN, count, declared, short, with_unit
-from pipeline.verdict.evidence import Table, lookup
+from pipeline.verdict.digits import THIN, count, short
+from pipeline.verdict.evidence import Table, entry, gap_of, need, need_figure, or_gap, or_nothing
 from pipeline.verdict.pairs import pair_names
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, Verdict, state
-from pipeline.verdict.wording import OFF_THE_SCALE, banded, places_of, worded
+from pipeline.verdict.wording import OFF_THE_SCALE, banded, limit_text, places_of, worded
 
 MOVES = "Heaters and motor to barrel temperatures"
 # the baseline that stands beside the pair if nobody runs yet
@@ -37,7 +28,6 @@ PI, IDLE = ("pi_simc", "pi"), "hold"
 FIGURES = ("settled_error", "settling")
 NOT_JUDGED = Missing(OPEN, "It was not judged")
 WITHOUT_GCODE = "printed_file"  # what ingest flags: the file of a print is not beside the log
-STYLES = {"dd": "line dd", "mb": "line", "bl": "line bl"}
 
 
 def card(sources: Sources, judged: Judgement, verdict: Verdict) -> Card:
@@ -47,18 +37,18 @@ def card(sources: Sources, judged: Judgement, verdict: Verdict) -> Card:
     third = next((q.key for q in judged.asked if verdict.rule and q.rule == verdict.rule), "overshoot")
     keys = [*FIGURES, "overshoot" if third in FIGURES else third]
     told = [name for name in names if judged.answers.get(name)]
-    gap = sources.metrics["evaluate_temperature"]
+    gap = gap_of(sources.metrics["evaluate_temperature"])
     return of_verdict(
         verdict,
         MOVES,
         _step(sources, verdict),
-        entrants=[Entrant(name, heading(name), note) for name, note in names.items()],
+        entrants=[entrant(name, heading(name), note) for name, note in names.items()],
         rows=[_row(asked[key], judged, list(names)) for key in keys if key in asked] if told else [],
         basis=f"90{THIN}% quantile; small: 90{THIN}% band",
         cost=_cost(sources),
         picture=deciding(sources, judged),
         sources=sources.source("evaluate_temperature"),
-        missing=gap.sentence() if isinstance(gap, Missing) else "",
+        missing=gap.sentence() if gap else "",
     )
 
 
@@ -73,16 +63,15 @@ def contestants(sources: Sources, judged: Judgement) -> dict[str, str]:
     return in_order(kinds, champion)
 
 
+@or_nothing
 def _cost(sources: Sources) -> str:
     """Minutes of record that were learned from."""
-    samples = lookup(sources.metrics["ingest"], "samples")
-    if isinstance(samples, Missing):
-        return ""
+    samples = need_figure(sources.metrics["ingest"], "samples")
     minutes = samples * sources.declared.machine.sample_time_s / 60
     return f"{short(minutes, 3)} minutes of record"
 
 
-def _row(question: Question, judged: Judgement, names: Sequence[str]) -> CardRow:
+def _row(question: Question, judged: Judgement, names: Sequence[str]) -> dict[str, Any]:
     figures = [judged.answers.get(name, {}).get(question.key, NOT_JUDGED) for name in names]
     places = places_of(question, figures[:2])
     # doing nothing is no contestant: it never overshoots
@@ -92,67 +81,62 @@ def _row(question: Question, judged: Judgement, names: Sequence[str]) -> CardRow
         if isinstance(figure, Figure) and name != IDLE
     ]
     best = (max if question.at_least else min)(values, default=math.nan)
-    limit = (
-        f"{'≥' if question.at_least else '≤'} "
-        f"{with_unit(question.limit, question.unit, declared(question.limit))}"
-        if math.isfinite(question.limit)
-        else ""
-    )
     # a row in which all are alike has no best one
     led = len({worded(question, value, places) for value in values}) > 1
-    return CardRow(
-        question.title.split(", ")[0],
-        limit,
-        [
+    return {
+        "title": question.title.split(", ")[0],
+        "limit": limit_text(question),
+        "cells": [
             _cell(question, figure, places, best, leads=led and name != IDLE)
             for name, figure in zip(names, figures, strict=True)
         ],
-    )
+    }
 
 
-def _cell(question: Question, figure: Figure | Missing, places: int, best: float, *, leads: bool) -> CardCell:
+def _cell(
+    question: Question, figure: Figure | Missing, places: int, best: float, *, leads: bool
+) -> dict[str, Any]:
     if isinstance(figure, Missing):
-        return CardCell(figure.state, bad=figure.state == FAILED)
+        return cell(figure.state, bad=figure.state == FAILED)
     text = worded(question, figure.value, places)
     best_one = (
         leads and math.isfinite(best) and text == worded(question, best, places) and text != OFF_THE_SCALE
     )
-    bad = math.isfinite(question.limit) and state(question, figure) == FAILED
-    return CardCell(text, banded(question, figure, places), best_one, bad)
+    return cell(
+        text,
+        banded(question, figure, places),
+        best=best_one,
+        bad=math.isfinite(question.limit) and state(question, figure) == FAILED,
+    )
 
 
-def _step(sources: Sources, verdict: Verdict) -> CardStep:
-    if isinstance(sources.metrics["evaluate_temperature"], Missing):
-        return CardStep("Run the stages of this loop.", "./run dvc repro evaluate_temperature")
+def _step(sources: Sources, verdict: Verdict) -> dict[str, str]:
+    if gap_of(sources.metrics["evaluate_temperature"]):
+        return step("Run the stages of this loop.", "./run dvc repro evaluate_temperature")
     if not sources.recorded:
-        return CardStep("Record your own machine.", "./run beadline init RECORDING.csv --copy")
+        return step("Record your own machine.", "./run beadline init RECORDING.csv --copy")
     if verdict.state == PASSED:
         folder = "datasets/export_controllers/temperature"
-        return CardStep(
+        return step(
             "Replay it on a recording before a trial.", f"./run beadline replay {folder} RECORDING.csv"
         )
-    if unrecorded := _without_gcode(sources):
-        return CardStep(
+    # how many prints of the recordings have no G-code file beside them
+    if unrecorded := int(entry(sources.metrics["ingest"], "findings", "recording", WITHOUT_GCODE) or 0):
+        return step(
             "Put the printed G-code files beside klippy.log: without them part fan and filament feed of "
             f"{count(unrecorded, 'print')} are not recorded.",
             "./run beadline init klippy.log --copy --force",
         )
-    return CardStep("Record the next experiment.", "./run beadline first-experiment")
+    return step("Record the next experiment.", "./run beadline first-experiment")
 
 
-def _without_gcode(sources: Sources) -> int:
-    """How many prints of the recordings have no G-code file beside them."""
-    found = lookup(sources.metrics["ingest"], "findings")
-    if isinstance(found, Missing):
-        return 0
-    return int(found.get("recording", {}).get(WITHOUT_GCODE, 0))
-
-
-def deciding(sources: Sources, judged: Judgement, size: tuple[int, int] = PICTURE) -> Deciding | Missing:
-    """The output furthest from its reference in the deciding case, a line a contestant."""
-    table = sources.tables["trajectories"]
-    if isinstance(table, Missing):
-        return table
+@or_gap
+def deciding(
+    sources: Sources, judged: Judgement, size: tuple[int, int] = PICTURE, lead: str = ""
+) -> Deciding | Missing:
+    """The output furthest from its reference in the deciding case, a line a contestant; `lead` begins the
+    finding."""
+    table = need(sources.tables["trajectories"])
     runs, zone = runs_of(sources, judged, table)
     if not runs:
         return Missing("not measured", "no trajectory of the deciding case was recorded")
@@ -163,7 +147,8 @@ def deciding(sources: Sources, judged: Judgement, size: tuple[int, int] = PICTUR
         who: float(np.abs(table[zone] - table[f"{zone}_reference"])[rows[-1]]) for who, rows in runs.items()
     }
     listed = ", ".join(f"{i} {heading(who)} {short(end, 2)}" for i, (who, end) in enumerate(ends.items(), 1))
-    finding = f"{label[:1].upper()}{label[1:]} ends off its reference by, in °C: {listed}. Grey: the limit."
+    finding = f"{lead}{label[:1].upper()}{label[1:]} ends off its reference by, in °C: {listed}."
+    finding = f"{finding} Grey: the limit."
     return Deciding(
         finding,
         _drawn(table, early, zone, sources.declared.rules.settled_error_degC, finding, size),
@@ -186,11 +171,10 @@ def _drawn(
         charts.linear(0, float(time[rows].max()) or 1.0), charts.Axis(0.01, most, ticks, True),
         *size, 40, 34, 22, 14,
     )  # fmt: skip
-    layers, used = [charts.level(frame, limit, "lim")], set()
+    layers, styles = [charts.level(frame, limit, "lim")], page.line_styles({who: who for who in runs})
     for i, (who, mine) in enumerate(runs.items(), 1):
-        style, y = STYLES.get(page.MARKS.get(who, "bl"), "line"), np.maximum(off[mine], 0.01)
-        layers.append(charts.line(frame, time[mine], y, style + (" dash" if style in used else ""), most=120))
-        used.add(style)
+        y = np.maximum(off[mine], 0.01)
+        layers.append(charts.line(frame, time[mine], y, styles[who], most=120))
         # a number of its own height each, where the line comes by
         at = int(np.argmax(np.log(y) <= np.log(y[0]) + (np.log(0.1) - np.log(y[0])) * i / (len(runs) + 1)))
         layers.append(charts.label(frame, time[mine[at]], y[at], str(i), dx=5, dy=4))

@@ -2,13 +2,12 @@
 moved since the accepted run."""
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 from pipeline.report.shared.difference import Difference, Move, difference, moves
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature.beside import best_sentence, deciding_sentence
-from pipeline.verdict.controllers import heading, kind
+from pipeline.verdict.controllers import YARDSTICKS, heading, in_a_sentence, kind
 from pipeline.verdict.decide import (
     LOOP,
     Standing,
@@ -19,11 +18,13 @@ from pipeline.verdict.decide import (
     standings,
     undeclared_outputs,
 )
-from pipeline.verdict.digits import count
+from pipeline.verdict.digits import count, listed, short
+from pipeline.verdict.evidence import Figures, entry
 from pipeline.verdict.night import Drift, drift, in_production
-from pipeline.verdict.pairs import pair_names, pair_sentence
+from pipeline.verdict.pairs import pair_names, pair_sentence, reference_of
 from pipeline.verdict.temperature import comparison, of_controller
 from pipeline.verdict.verdict import OPEN, Answers, Figure, PairSentence, Question, Verdict
+from pipeline.verdict.wording import name_first
 
 
 class Judgement(NamedTuple):
@@ -91,79 +92,105 @@ def named_before(sources: Sources) -> str:
     return str(sources.accepted.get("winner") or "")
 
 
-class RuleLine(NamedTuple):
-    """A rule with the number of its answers, and its state for the two contestants that are shown."""
-
-    rule: str
-    answers: str
-    states: tuple[str, ...]
-    first: bool
+def heads(names: Sequence[str]) -> list[dict[str, str]]:
+    """The contestants above columns of rules or figures."""
+    return [{"mark": name, "name": heading(name), "kind": kind(name)} for name in names]
 
 
-class RulesHead(NamedTuple):
-    """The contestant above a column of rules or answers."""
-
-    mark: str
-    name: str
-    kind: str
-
-
-class VerdictParts(NamedTuple):
-    """The head of the page: decision, reason, remedy, rules, and what changed since the accepted run."""
-
-    state: str
-    decision: str
-    lead: str
-    reason: str
-    remedy: str
-    heads: list[RulesHead]
-    rules: list[RuleLine]
-    claim: str
-    changed: str
-
-
-def heads(judged: Judgement) -> list[RulesHead]:
-    return [RulesHead(name, heading(name), kind(name)) for name in (judged.subject, judged.rival)]
-
-
-def verdict_parts(judged: Judgement, *, claim: str = "") -> VerdictParts:
-    """The verdict in words; `claim` says under which condition it holds."""
+def verdict_parts(judged: Judgement, *, claim: str = "") -> dict[str, Any]:
+    """The head of the page: decision, reason, remedy, rules with the numbers of their answers and their
+    states for the two contestants, and what changed since the accepted run; `claim` says under which
+    condition it holds."""
     verdict = judged.verdict
-    rules = [
-        RuleLine(
-            line[0].name[:1].upper() + line[0].name[1:],
-            groups()[line[0].name][1],
-            tuple(rule.state for rule in line),
-            first=line[0].name == verdict.rule,
-        )
-        for line in verdict.rules
-    ]
     parameters = judged.changed.parameters if judged.changed else []
     changed = f"{count(len(parameters), 'parameter').capitalize()} changed since the accepted run"
-    return VerdictParts(
-        verdict.word,
-        verdict.decision,
-        verdict.lead,
-        verdict.reason,
-        verdict.remedy,
-        heads(judged),
-        rules,
-        claim,
-        changed if parameters else "",
-    )
+    return {
+        "state": verdict.word,
+        "decision": verdict.decision,
+        "lead": verdict.lead,
+        "reason": verdict.reason,
+        "remedy": verdict.remedy,
+        "heads": heads((judged.subject, judged.rival)),
+        "rules": [
+            {
+                "rule": line[0].name[:1].upper() + line[0].name[1:],
+                "answers": groups()[line[0].name][1],
+                "states": [rule.state for rule in line],
+                "first": line[0].name == verdict.rule,
+            }
+            for line in verdict.rules
+        ],
+        "claim": claim,
+        "changed": changed if parameters else "",
+    }
 
 
 def shown(judged: Judgement) -> dict[str, dict[str, dict[str, float | None]]]:
-    """The figures of the pages as numbers, for the metrics: later runs are held against them."""
+    """The figures of the pages as numbers, for the metrics: later runs are held against them. None is
+    without end."""
     return {
         name: {
-            key: {"median": _plain(f.value), "low": _plain(f.low), "high": _plain(f.high)}
-            for key, f in answers.items()
-            if isinstance(f, Figure)
+            key: {
+                end: value if math.isfinite(value) else None
+                for end, value in zip(("median", "low", "high"), figure[:3], strict=True)
+            }
+            for key, figure in answers.items()
+            if isinstance(figure, Figure)
         }
         for name, answers in judged.answers.items()
     }
 
 
-def _plain(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def deciding_sentence(figures: Figures, winner: str | None) -> str:
+    """Which case decides, and the verdict without its plant."""
+    case = entry(comparison(figures), "deciding")
+    if not isinstance(case, Mapping) or entry(case, "plant") is None:
+        return ""
+    compared, plant = comparison(figures), case["plant"]
+    kind = f", {reference_of(case)}" if case.get("kind") else ""
+    changes = []
+    if entry(compared, "best") == winner and case.get("best_without") != winner:
+        other = case.get("best_without")
+        changes.append(f"the best would be {in_a_sentence(other)}" if other else "nobody would pass")
+    pair = entry(compared, "pair", "winner")
+    if case.get("pair_without") != pair:
+        other = case.get("pair_without")
+        changes.append(
+            f"the pair would go to {in_a_sentence(other)}" if other else "the pair would be undecided"
+        )
+    without = " and ".join(changes) if changes else "the same"
+    return f"Deciding case: plant {plant}{kind}. Without plant {plant} {without}."
+
+
+def best_sentence(figures: Figures, held: Mapping[str, Standing], winner: str | None) -> str:
+    """The best of all contestants, beside the pair."""
+    if winner is None:
+        cheapest = entry(comparison(figures), "best_reason", "leading")
+        costs = f" {name_first(cheapest)} costs least." if cheapest in held else ""
+        return f"Best of all: nobody passes every rule.{costs}"
+    others = [
+        in_a_sentence(name)
+        for name, standing in held.items()
+        if standing.passes and name != winner and name not in YARDSTICKS
+    ]
+    beside = f"; {listed(others)} {'passes' if len(others) == 1 else 'pass'} too" if others else ""
+    cheapest = entry(comparison(figures), "best")
+    if cheapest in held and cheapest != winner:
+        return (
+            f"On this record {in_a_sentence(cheapest)} is the best{_ahead(figures, cheapest)}; "
+            f"named is {in_a_sentence(winner)}{beside}."
+        )
+    return f"Best of all that pass: {in_a_sentence(winner)}{_ahead(figures, winner)}{beside}."
+
+
+def _ahead(figures: Figures, winner: str) -> str:
+    """By how much the winner is cheaper than the cheapest other that passes, or that chance may be it."""
+    reason = entry(comparison(figures), "best_reason")
+    percent, p = entry(reason, "improvement_percent"), entry(reason, "p")
+    if entry(comparison(figures), "best") != winner or not isinstance(percent, int | float):
+        return ""
+    nearest = in_a_sentence(entry(reason, "nearest"))
+    if isinstance(p, int | float) and p < 0.05 and percent > 0:
+        return f", {short(percent, 2)}\u00a0% cheaper than {nearest}"
+    chance = f", the simplest; {nearest} is cheaper by no more than chance"
+    return chance if percent < 0 else f"; {nearest} is next"

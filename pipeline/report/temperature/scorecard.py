@@ -5,14 +5,15 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature.judgement import Judgement
-from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading, in_a_sentence, kind
-from pipeline.verdict.digits import THIN, count, declared, number, short, with_unit
-from pipeline.verdict.evidence import entry
+from pipeline.report.temperature.judgement import Judgement, heads
+from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading, in_a_sentence
+from pipeline.verdict.digits import THIN, count, number, short
+from pipeline.verdict.evidence import Absent, entry, gap_of, need
 from pipeline.verdict.temperature import comparison, finite, names, refused, unstable
 from pipeline.verdict.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
-from pipeline.verdict.wording import banded, places_of, worded
+from pipeline.verdict.wording import banded, limit_text, places_of, worded
 
 # figures without a rule
 UNRULED = (
@@ -40,25 +41,28 @@ ORDER = (
 )
 
 
+@as_table(heads=[], rows=[], caption="", below=[])
 def scorecard(sources: Sources, judgement: Judgement, words: Mapping[str, str]) -> dict[str, Any]:
     """Every contestant that was judged, in the order of simplicity, and those that were refused."""
     metrics = sources.metrics
     compared = comparison(metrics)
     judged = names(metrics)
     if not judged:
-        gap = metrics["evaluate_temperature"]
-        why = gap if isinstance(gap, Missing) else Missing("not measured", "No contestant was judged")
-        return {"missing": why, "heads": [], "rows": [], "caption": "", "below": []}
+        gap = gap_of(metrics["evaluate_temperature"])
+        raise Absent(gap or Missing("not measured", "No contestant was judged"))
     asked = {question.key: question for question in (*judgement.asked, *UNRULED)}
-    rows = [_row(sources, asked[key], judged, judgement, words.get(key, "")) for key in ORDER if key in asked]
     return {
-        "missing": None,
-        "heads": [{"mark": name, "name": heading(name), "kind": kind(name)} for name in judged],
-        "rows": rows,
+        "heads": heads(judged),
+        "rows": [
+            _row(sources, asked[key], judged, judgement, words.get(key, "")) for key in ORDER if key in asked
+        ],
         "caption": _caption(sources),
         "below": [
             *filter(None, [_gap(compared, judged), _at_bound(compared, judged), _broken(compared, judged)]),
-            *_refused(sources),
+            *(
+                f"{heading(name)[:1].upper()}{heading(name)[1:]} is refused: {why.rstrip('.')}."
+                for name, why in refused(metrics).items()
+            ),
         ],
     }
 
@@ -97,15 +101,16 @@ def _row(
     ]
     best = (max if question.at_least else min)(values, default=math.nan)
     alike = len(set(values)) < 2 or question.key == "data"
-    cells = [
-        _cell(sources, question, name, figure, best=not alike and getattr(figure, "value", None) == best)
-        for name, figure in zip(names, figures, strict=True)
-    ]
-    limit = "none" if question.key in ("crossings", "supervisor") else ""
-    if not limit and math.isfinite(question.limit):
-        sign = "≥" if question.at_least else "≤"
-        limit = f"{sign} {with_unit(question.limit, question.unit, declared(question.limit))}"
-    return {"key": question.key, "title": question.title, "word": word, "limit": limit, "cells": cells}
+    return {
+        "key": question.key,
+        "title": question.title,
+        "word": word,
+        "limit": "none" if question.key in ("crossings", "supervisor") else limit_text(question),
+        "cells": [
+            _cell(sources, question, name, figure, best=not alike and getattr(figure, "value", None) == best)
+            for name, figure in zip(names, figures, strict=True)
+        ],
+    }
 
 
 def _competes(name: str) -> bool:
@@ -239,13 +244,6 @@ def _broken(compared: Mapping[str, Any], names: list[str]) -> str:
     )
 
 
-def _refused(sources: Sources) -> list[str]:
-    return [
-        f"{heading(name)[:1].upper()}{heading(name)[1:]} is refused: {why.rstrip('.')}."
-        for name, why in refused(sources.metrics).items()
-    ]
-
-
 def infeasible(sources: Sources) -> list[str]:
     """References that the machine cannot hold, each with the actuator that binds."""
     sentences = []
@@ -268,11 +266,10 @@ def infeasible(sources: Sources) -> list[str]:
 # ---- what was tuned and declared
 
 
+@as_table(rows=[])
 def weights(sources: Sources) -> dict[str, Any]:
     """The tuned values of every contestant, from the weights that were stored."""
-    table = sources.tables["weights"]
-    if isinstance(table, Missing):
-        return {"missing": table, "rows": []}
+    table = need(sources.tables["weights"])
     tuned = entry(table, "contestants") or {}
     rows = [
         (
@@ -286,8 +283,9 @@ def weights(sources: Sources) -> dict[str, Any]:
         for name in (*BY_NAME, *(name for name in tuned if name not in BY_NAME))
         if isinstance(tuned.get(name), Mapping)
     ]
-    gap = None if rows else Missing("not measured", "no contestant was tuned")
-    return {"missing": gap, "rows": rows}
+    if not rows:
+        raise Absent(Missing("not measured", "no contestant was tuned"))
+    return {"rows": rows}
 
 
 def _listed(value: Any) -> str:

@@ -6,19 +6,18 @@ import hashlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.certificate import exported
-from pipeline.report.shared import charts, page
+from pipeline.report.shared import page
+from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources, copies
-from pipeline.report.temperature.deciding import degrees, runs_of, until_settled
+from pipeline.report.temperature.card import deciding
 from pipeline.report.temperature.judgement import Judgement
+from pipeline.report.temperature.pictures import runs_of, until_settled
 from pipeline.report.viewer import packed, series
-from pipeline.verdict.controllers import heading
-from pipeline.verdict.digits import THIN, number, short
-from pipeline.verdict.evidence import OFF
-from pipeline.verdict.verdict import Missing
+from pipeline.verdict.digits import number
+from pipeline.verdict.evidence import OFF, gap_of, need, or_no_entries
 
 VENDOR = Path(__file__).parent / "vendor"
 LIBRARY = "uPlot.js"
@@ -44,41 +43,20 @@ def render(sources: Sources, judged: Judgement) -> Viewer:
         table = sources.tables["every_lesson" if shown.name == "lessons" else shown.name]
         if table is OFF:
             continue
-        if isinstance(table, Missing):
-            rows.append(
-                {
-                    "title": shown.title,
-                    "note": shown.note,
-                    "rows": "",
-                    "link": "",
-                    "size": "",
-                    "source": "",
-                    "missing": table,
-                    "left_out": "",
-                }
-            )
+        row: dict[str, Any] = {"title": shown.title, "note": shown.note, "missing": gap_of(table)}
+        row |= dict.fromkeys(("rows", "link", "size", "source", "left_out"), "")
+        rows.append(row)
+        if row["missing"]:
             continue
         source = sources.source(shown.name)[0]
         link, size = source.link, packed.size_of(source)
-        found = packed.packed(shown, table, room)
+        found = packed.packed(shown, need(table), room)
         room -= sum(map(len, found.files.values()))
         files |= found.files
         if found.entry["books"]:
             entries.append(found.entry | {"link": link, "size": size, "path": source.path})
-        left_out = _left_out(found.entry)
-        count = number(found.entry["rows"], 0)
-        rows.append(
-            {
-                "title": shown.title,
-                "note": shown.note,
-                "rows": count,
-                "link": link,
-                "size": size,
-                "source": source.path,
-                "missing": None,
-                "left_out": left_out,
-            }
-        )
+        row |= {"rows": number(found.entry["rows"], 0), "link": link, "size": size, "source": source.path}
+        row["left_out"] = _left_out(found.entry)
     script = page.environment().get_template("viewer.js").render().strip()
     text = page.render(
         "viewer.html",
@@ -116,10 +94,11 @@ def _left_out(entry: dict[str, Any]) -> str:
 # ---- the deciding case
 
 
+@or_no_entries
 def start(sources: Sources, judged: Judgement) -> dict[str, Any]:
     """What the viewer shows where its address says nothing: the deciding case of the temperature loop."""
-    table = sources.tables["trajectories"]
-    if isinstance(table, Missing) or not len(table["time_s"]):
+    table = need(sources.tables["trajectories"])
+    if not len(table["time_s"]):
         return {}
     runs, zone = runs_of(sources, judged, table)
     if not runs:
@@ -131,51 +110,12 @@ def start(sources: Sources, judged: Judgement) -> dict[str, Any]:
     return place
 
 
-STYLES = {"dd": "line dd", "mb": "line", "bl": "line bl"}
-
-
+@as_table(text="", picture=Markup(""), origin=Markup(""))
 def still(sources: Sources, judged: Judgement) -> dict[str, Any]:
-    """The output furthest from its reference in the deciding case, a numbered line a contestant."""
-    table = sources.tables["trajectories"]
-    if isinstance(table, Missing):
-        return {"text": "", "picture": Markup(""), "names": [], "origin": Markup(""), "missing": table}
-    runs, zone = runs_of(sources, judged, table)
-    if not runs:
-        gap = Missing("not measured", "no trajectory of the deciding case was recorded")
-        return {"text": "", "picture": Markup(""), "names": [], "origin": Markup(""), "missing": gap}
-    label = sources.zone([o.name for o in sources.declared.machine.outputs].index(zone))
-    seconds, time = until_settled(table, runs, zone), table["time_s"]
-    early = {who: rows[time[rows] <= seconds] for who, rows in runs.items()}
-    frame = charts.Frame(
-        charts.linear(0, seconds or 1.0),
-        degrees(table, np.concatenate(list(early.values())), zone),
-        width=360,
-        height=240,
-        left=44,
-        below=20,
-        above=20,
-        right=18,
-    )
-    first = next(iter(early.values()))
-    layers = [charts.line(frame, time[first], table[f"{zone}_reference"][first], "ref")]
-    names, used = [], set()
-    for i, (who, rows) in enumerate(early.items(), 1):
-        style, y = STYLES.get(page.MARKS.get(who, "bl"), "line"), table[zone][rows]
-        layers.append(charts.line(frame, time[rows], y, style + (" dash" if style in used else "")))
-        used.add(style)
-        end = float(np.abs(table[zone] - table[f"{zone}_reference"])[runs[who][-1]])
-        names.append(f"{i} {heading(who)}: ends {short(end, 2)}{THIN}°C from it")
-        # a number of its own height each, where the line comes by
-        at = int(np.argmax(np.abs(y - y[0]) >= np.ptp(y) * i / (len(runs) + 1)))
-        layers.append(charts.label(frame, time[rows[at]], y[at], str(i), dx=5, dy=4))
-    text = f"The deciding case: {label} under {len(runs)} contestants, dashed its reference."
-    shown = f"The first {short(seconds, 2)} s. " if seconds < float(time.max()) else ""
-    alt, units = f"{text} {'; '.join(names)}", ("s", "°C")
-    picture = charts.panel(frame, layers, alt=alt, css="mb", title=f"{label}, °C", units=units)
+    """What stands where no script runs: the deciding case of the temperature loop, as page one draws it."""
+    found = need(deciding(sources, judged, (360, 240), "The deciding case: "))
     return {
-        "text": f"{text} {shown}".strip(),
-        "picture": picture,
-        "names": names,
+        "text": found.finding,
+        "picture": found.drawn,
         "origin": page.files(sources.source("trajectories")),
-        "missing": None,
     }

@@ -16,8 +16,7 @@ from pipeline.report.shared.page import MARKS
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.controllers import KINDS
 from pipeline.verdict.controllers import heading
-from pipeline.verdict.evidence import Table
-from pipeline.verdict.verdict import Missing
+from pipeline.verdict.evidence import Table, gap_of, known, need, or_empty
 
 UNITS = {"degC": "°C", "percent": "%", "mm^3/s": "mm³/s", "1": "", "degC per percent": "°C/%"}
 
@@ -154,11 +153,11 @@ def _record(
     acting = [(signal.name, signal.unit) for signal in sources.declared.machine.acting]
     lines = [SeriesLine(name, label, unit, name, "Temperature") for name, unit, label in outputs]
     lines += [SeriesLine(name, name, unit, name, "Command", steps=True) for name, unit in acting]
-    quality = sources.tables["quality"]
+    quality = known(sources.tables["quality"], None)
 
     def events(rows: Table) -> list[Event]:
         time, found = rows["time_s"], []
-        if not isinstance(quality, Missing):
+        if quality:
             for i in np.flatnonzero(quality["recording"] == rows["recording"][0]):
                 start, end = float(quality["start_s"][i]), float(quality["end_s"][i])
                 if start <= time[-1] and end >= time[0]:
@@ -287,11 +286,10 @@ def _signals(sources: Sources) -> ViewerTable:
     lines += [SeriesLine(f"{name}_mm3_per_s", label, "mm^3/s", "flow", "Flow") for name, label in COMPOSERS]
     lines += [SeriesLine("command_mm", "plunger command", "mm", "command", "Command")]
     lines += [SeriesLine(f"{axis}_mm", f"gantry {axis}", "mm", "gantry", "Gantry") for axis in "xy"]
-    tasks = sources.tables["tasks"]
 
+    @or_empty
     def events(rows: Table) -> list[Event]:
-        if isinstance(tasks, Missing):
-            return []
+        tasks = need(sources.tables["tasks"])
         mine = (tasks["part"] == rows["part"][0]) & (tasks["tool"] == rows["tool"][0])
         return [
             Event(float(tasks["begin_s"][i]), float(tasks["end_s"][i]), str(tasks["task"][i]))
@@ -314,7 +312,7 @@ def _signals(sources: Sources) -> ViewerTable:
 
 def _setpoint_marks(sources: Sources) -> Callable[[str], str]:
     """The mark of a controller by its kind; none without a scoreboard."""
-    if isinstance(sources.tables["scoreboard"], Missing):
+    if gap_of(sources.tables["scoreboard"]):
         return lambda name: ""
     marks = {"data-driven": "dd", "model-based": "mb", "reference": "mb"}
     return lambda name: marks.get(KINDS.get(name, ""), "bl")
@@ -367,7 +365,7 @@ def _paths(sources: Sources) -> ViewerTable:
 
     @functools.cache
     def happens(case: tuple[str, str]) -> Clog | None:
-        return None if isinstance(table, Missing) else clog(table, case)
+        return clog(need(table), case)
 
     def events(rows: Table) -> list[Event]:
         found = happens((str(rows["simulator"][0]), str(rows["case"][0])))
