@@ -528,7 +528,8 @@ def _tell(name: str, command: argparse.ArgumentParser) -> None:
     command.epilog = f"Example: {example} | Exit status: {OTHER_STATUSES.get(name, STATUSES)}"
 
 
-def main() -> None:
+def parser() -> argparse.ArgumentParser:
+    """Every command with its options."""
     parser = argparse.ArgumentParser(
         prog="beadline", description="Extrusion-printer recordings into controllers that can be trusted."
     )
@@ -639,7 +640,11 @@ def main() -> None:
     nights.add(commands, render_night)
     for name, command in commands.choices.items():
         _tell(name, command)
-    arguments = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    arguments = parser().parse_args()
     try:
         arguments.run(arguments)
     except (ValueError, OSError, MemoryError) as error:

@@ -3,6 +3,7 @@ those of the accepted run, and its commands exist."""
 
 import argparse
 import copy
+import importlib.util
 import re
 import runpy
 import shlex
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from pipeline import cli
 from pipeline.setpoint.agents import score
@@ -257,5 +259,49 @@ def test_no_page_and_no_document_advises_to_deploy(root):
     pages = [*(root / "pipeline/report/templates").glob("*"), *(root / "docs").rglob("*"), root / "README.md"]
     advice = re.compile(r"(?<!pipeline/)\bdeploy\b", re.IGNORECASE)  # but for the folder of the code
     assert not [
-        path.name for path in pages if path.is_file() and advice.search(path.read_text(encoding="utf-8"))
+        path.name
+        for path in pages
+        if path.suffix in {".md", ".py", ".html", ".toml", ".css", ".js"}
+        and "_build" not in path.parts
+        and advice.search(path.read_text(encoding="utf-8"))
     ]
+
+
+# ---- the reference that the code itself states
+
+
+@pytest.fixture(scope="module")
+def generated(root):
+    """docs/generated.py; it needs no Sphinx."""
+    spec = importlib.util.spec_from_file_location("generated", root / "docs/generated.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_part_of_the_reference_has_a_place_on_a_page_and_every_place_a_part(root, generated):
+    pages = "".join(path.read_text(encoding="utf-8") for path in (root / "docs").rglob("*.md"))
+    places = re.findall(r"<!-- generated: ([\w ]+) -->", pages)
+    assert sorted(places) == sorted(generated.PARTS)
+    with pytest.raises(KeyError, match="no such part"):
+        generated.fill("<!-- generated: no such part -->")
+
+
+def test_the_reference_has_every_key_of_the_parameter_files(root, generated):
+    text = generated.parameters()
+    named = set(re.findall(r"^\| `([^`]+)`", text, re.MULTILINE))
+    for path in ("params.yaml", "params.expert.yaml"):
+        for section, values in yaml.safe_load((root / path).read_text(encoding="utf-8")).items():
+            for key in values:
+                assert any(re.match(rf"{section}\.{key}(\W|$)", name) for name in named), f"{section}.{key}"
+    assert "| `plant.sample_time_s` | s | number, > 0, ≤ 3600 | `1.0` |" in text
+    assert "Read by: `render_frames`, `train_classifier`" in text
+
+
+def test_the_reference_has_every_stage_command_and_word(root, generated):
+    stages = yaml.safe_load((root / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
+    assert re.findall(r"^## (\w+)$", generated.wiring(), re.MULTILINE) == list(stages)
+    commands = generated.commands()
+    assert all(f"## {name}\n" in commands for name in cli.EXAMPLES)
+    assert "| `--to` |" in commands
+    assert "Disk margin\n  Change of gain and phase" in generated.glossary()
