@@ -7,7 +7,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
 
 project, author, html_title = "beadline", "The beadline maintainers", "beadline"
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "generated"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "generated"]
 exclude_patterns = ["_build"]
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
@@ -15,3 +15,4 @@ html_theme, pygments_style = "furo", "default"
 html_show_sourcelink = html_copy_source = False
 autodoc_member_order, autodoc_typehints = "bysource", "signature"
 suppress_warnings = ["config.cache"]
+smartquotes = False

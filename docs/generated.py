@@ -253,11 +253,8 @@ def glossary() -> str:
     meanings: dict[str, list[str]] = {}
     for word, meaning in sorted(words.FIXED.values(), key=lambda pair: pair[0].lower()):
         meanings.setdefault(word, []).append(meaning)
-    return (
-        "```{glossary}\n"
-        + "\n".join(f"{word}\n  {' '.join(texts)}" for word, texts in meanings.items())
-        + "\n```"
-    )
+    entries = (f"{word}\n  {' '.join(texts)}" for word, texts in meanings.items())
+    return "```{glossary}\n" + "\n\n".join(entries) + "\n```"
 
 
 def public_names() -> str:
@@ -265,17 +262,40 @@ def public_names() -> str:
     parts = []
     for loop in LOOPS:
         package = importlib.import_module(f"pipeline.{loop}")
-        lines = [f"## {loop.capitalize()}\n\n{inspect.cleandoc(package.__doc__ or '')}\n\n```{{eval-rst}}"]
+        lines = [f"## {loop.capitalize()}\n\n```{{eval-rst}}", f".. automodule:: pipeline.{loop}"]
         for name in package.__all__:
-            kind = "autoclass" if inspect.isclass(getattr(package, name)) else "autofunction"
-            lines.append(f".. {kind}:: pipeline.{loop}.{name}")
+            value = getattr(package, name)
+            kind = "class" if inspect.isclass(value) else "function" if inspect.isroutine(value) else "data"
+            lines.append(f".. auto{kind}:: pipeline.{loop}.{name}")
         parts.append("\n\n".join(lines) + "\n```")
     return "\n\n".join(parts)
 
 
+def plain_docstring(_app: Any, _what: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
+    """Changes the lines of a docstring, which is plain text, to reStructuredText that looks the same.
+
+    Equations and what is indented keep their lines; an example stays; signs with a meaning are escaped.
+    """
+    blocks = []
+    for block in "\n".join(lines).split("\n\n"):
+        rows = block.split("\n")
+        if block.startswith(">>>"):
+            blocks.append(block)
+        elif all(re.match(r"    |.* (=|<-) .*[^.]$", row) for row in rows):
+            blocks.append("::\n\n" + "\n".join(f"    {row}" for row in rows))
+        else:
+            escaped = re.sub(r"`([^`]*)`|([|*\\]|_(?!\w))", _escape, block)
+            blocks.append(escaped)
+    lines[:] = "\n\n".join(blocks).split("\n")
+
+
+def _escape(match: re.Match[str]) -> str:
+    return f"\\{match[2]}" if match[2] else f"``{match[1]}``"
+
+
 PARTS = {
     "commands": commands, "parameters": parameters, "stages": wiring, "tables": tables, "metrics": metrics,
-    "glossary": glossary,
+    "glossary": glossary, "public names": public_names,
 }  # fmt: skip
 
 
@@ -287,4 +307,5 @@ def fill(text: str) -> str:
 def setup(app: Any) -> dict[str, bool]:
     """Registers the extension with Sphinx."""
     app.connect("source-read", lambda _app, _name, source: source.__setitem__(0, fill(source[0])))
+    app.connect("autodoc-process-docstring", plain_docstring)
     return {"parallel_read_safe": True}

@@ -3,10 +3,14 @@ those of the accepted run, and its commands exist."""
 
 import argparse
 import copy
+import doctest
+import importlib
 import importlib.util
 import re
 import runpy
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -305,3 +309,21 @@ def test_the_reference_has_every_stage_command_and_word(root, generated):
     assert all(f"## {name}\n" in commands for name in cli.EXAMPLES)
     assert "| `--to` |" in commands
     assert "Disk margin\n  Change of gain and phase" in generated.glossary()
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_the_public_names_of_a_loop_are_there_explained_and_their_example_runs(loop):
+    package = importlib.import_module(f"pipeline.{loop}")
+    ran = doctest.testmod(package)
+    assert ran.failed == 0 and ran.attempted >= 8
+    for name in package.__all__:
+        value = getattr(package, name)
+        assert value.__doc__ or not callable(value), name
+    with pytest.raises(AttributeError, match=f"module 'pipeline.{loop}' has no attribute 'no_such_name'"):
+        package.no_such_name  # noqa: B018
+
+
+def test_a_package_of_public_names_loads_no_method(root):
+    code = "import sys; from pipeline import temperature, deposition, setpoint; print('numpy' in sys.modules)"
+    ran = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    assert ran.stdout == "False\n"
