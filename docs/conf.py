@@ -14,5 +14,4 @@ myst_heading_anchors = 3
 html_theme, pygments_style = "furo", "default"
 html_show_sourcelink = html_copy_source = False
 autodoc_member_order, autodoc_typehints = "bysource", "signature"
-suppress_warnings = ["config.cache"]
 smartquotes = False

@@ -53,32 +53,50 @@ def first_sentence(text: str | None) -> str:
 
 
 def commands() -> str:
-    """Each command with its usage, options and exit statuses, by the groups of `--help`."""
-    return "\n\n".join(
-        f"## {name}\n\n{command.description}\n\n```text\n{_usage(command)}\n```\n\n{_options(command)}"
-        for name, command in _commands(cli.parser()).items()
-    )
-
-
-def _commands(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
-    actions = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
-    return actions[0].choices
-
-
-def _usage(command: argparse.ArgumentParser) -> str:
-    return " ".join(command.format_usage().removeprefix("usage: ").split())
+    """Each command with its usage, options, example and exit statuses, by the groups of `--help`."""
+    parsers = cli.choices(cli.parser())
+    parts = []
+    for group, lines in cli.GROUPS.items():
+        parts.append(f"## {group}")
+        for name in [one for one in cli.COMMANDS if one.split()[0] in lines]:
+            command = parsers[name.split()[-1]]
+            about = " ".join((cli.COMMANDS[name].run.__doc__ or "").split())
+            usage = " ".join(command.format_usage().removeprefix("usage: ").split())
+            parts += [
+                f"### {name}",
+                f"{lines[name.split()[0]]}. {about}",
+                f"```text\n{usage}\n```",
+                _options(command),
+            ]
+            parts.append(f"Example: `./run beadline {f'{name} {cli.COMMANDS[name].example}'.strip()}`")
+    return "\n\n".join(parts)
 
 
 def _options(command: argparse.ArgumentParser) -> str:
+    actions = [action for action in command._actions if not isinstance(action, argparse._HelpAction)]
     rows = [
         (
             f"`{', '.join(action.option_strings) or action.metavar or action.dest}`",
             (action.help or "").replace("%%", "%"),
+            ""
+            if action.default in (None, False, "") or action.default != action.default
+            else f"`{action.default}`",
         )
-        for action in command._actions
-        if not isinstance(action, argparse._HelpAction)
+        for action in actions
     ]
-    return (table(("Option", "Effect"), rows) + "\n\n" if rows else "") + str(command.epilog or "")
+    return table(("Argument", "Effect", "Default"), rows) if rows else "No options."
+
+
+def exit_codes() -> str:
+    """The exit statuses of the commands and of `nightly`: meaning, and what to do."""
+    return "\n\n".join(
+        f"`{name}`:\n\n"
+        + table(("Code", "Meaning", "What to do"), [(code, *words) for code, words in statuses.items()])
+        for name, statuses in (
+            ("./run beadline COMMAND", cli.STATUSES),
+            ("./run beadline nightly", cli.NIGHTLY_STATUSES),
+        )
+    )
 
 
 # ---- parameters
@@ -294,7 +312,8 @@ def _escape(match: re.Match[str]) -> str:
 
 
 PARTS = {
-    "commands": commands, "parameters": parameters, "stages": wiring, "tables": tables, "metrics": metrics,
+    "commands": commands, "exit codes": exit_codes, "parameters": parameters,
+    "stages": wiring, "tables": tables, "metrics": metrics,
     "glossary": glossary, "public names": public_names,
 }  # fmt: skip
 

@@ -140,7 +140,7 @@ def _step(sources: Sources, verdict: Verdict) -> CardStep:
     if verdict.rehearsal:
         return CardStep(
             "Film the training print; frames go to datasets/raw/setpoint.",
-            "./run beadline training-print training.gcode",
+            "./run beadline experiment setpoint training.gcode",
         )
     if verdict.state == PASSED:
         return CardStep("Watch a print without steering it.", "./run beadline shadow FRAMES")

@@ -137,7 +137,7 @@ def _step(sources: Sources, verdict: Verdict) -> CardStep:
             f"{count(unrecorded, 'print')} are not recorded.",
             "./run beadline init klippy.log --copy --force",
         )
-    return CardStep("Record the next experiment.", "./run beadline first-experiment")
+    return CardStep("Record the next experiment.", "./run beadline experiment temperature")
 
 
 def _without_gcode(sources: Sources) -> int:
