@@ -683,7 +683,7 @@ def parser() -> argparse.ArgumentParser:
     for name in [name for commands in GROUPS.values() for name in commands]:
         parts = [part for part in COMMANDS if part.split()[0] == name]
         if parts != [name]:
-            command = commands.add_parser(name, description=_line(name))
+            command = commands.add_parser(name, description=f"{_line(name)}.", epilog=_ending(parts[0]))
             within[name] = command.add_subparsers(required=True, metavar="WHAT")
         for part in parts:
             inner = within.get(name, commands)

@@ -131,6 +131,14 @@ def test_the_help_of_a_command_has_an_example_exit_statuses_and_defaults(beadlin
         assert settings["help"], names
 
 
+@pytest.mark.parametrize("name", ["calibrate", "experiment"])
+def test_the_help_of_a_command_of_several_parts_names_them_with_an_example(beadline, name):
+    status, text, _ = beadline(name, "--help")
+    assert status == 0 and f"Example: ./run beadline {name} " in text and "Exit status:\n  0   done" in text
+    listed = re.findall(r"^    (\w+)", text, re.MULTILINE)
+    assert listed == [part.split()[1] for part in cli.COMMANDS if part.startswith(f"{name} ")]
+
+
 @pytest.mark.parametrize(
     ("typed", "meant"),
     [
