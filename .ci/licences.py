@@ -1,8 +1,8 @@
 """The licences of what the lock installs, as docs/licences.md.
 
 `./run python .ci/licences.py --record` writes the page from the packages' own metadata; without `--record` it
-says in which lines the page differs, and ends with 1. Packages that only other machines, a GPU, a cluster or
-the peers of speed need are named without a licence: they are not installed here.
+says in which lines the page differs, and ends with 1. Packages that only other machines, a GPU, a cluster,
+the documents or the peers of speed need are named without a licence: they are not installed here.
 """
 
 import importlib.metadata
@@ -104,7 +104,7 @@ def page(packages: list[Package]) -> str:
         "|---|---|---|",
         *(f"| {one.name} | {one.version} | {(one.licence or '').replace('|', '/')} |" for one in here),
         "",
-        f"Locked but not installed by `./run` ({len(apart)}; a GPU, a cluster, S3, peers of speed, "
+        f"Locked but not installed by `./run` ({len(apart)}; a GPU, a cluster, S3, documents, peers, "
         "other systems): " + ", ".join(f"{one.name} {one.version}" for one in apart) + ".",
         "",
     ]

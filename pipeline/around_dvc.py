@@ -36,14 +36,19 @@ RUNS_STAGES = (*MAKES_PAGES, "beadline quick ")
 def main() -> None:
     options, *command = sys.argv[1:]
     words = " ".join(command) + " "
-    shows_only = {"--help", "-h", "--dry"}.intersection(command)
+    shows_only = {"--help", "-h", "--dry", "--dry-run", "--rollback"}.intersection(command)
     elsewhere = {"--queue", "--temp", "--watch"}.intersection(command)
     loops: dict[str, bool] = {}
     if words.startswith(MAKES_PAGES) and not shows_only and not elsewhere:
         write_machine(options)
     if words.startswith("dvc "):
         remove_empty_locks(ROOT / ".dvc/tmp/rwlock")
-    if words.startswith(("dvc ", "beadline nightly ", "beadline quick ")):
+    # a log has no use for progress bars
+    if not sys.stderr.isatty():
+        os.environ.setdefault("TQDM_DISABLE", "1")
+    # production goes back whatever the parameters are
+    by_hand = words.startswith("beadline nightly ") and "--rollback" in words
+    if words.startswith(("dvc ", "beadline nightly ", "beadline quick ")) and not by_hand:
         try:
             for folder in dict.fromkeys([RAW, Path(os.path.relpath(ROOT / RAW))]):
                 check_plain_files(folder)

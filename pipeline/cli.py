@@ -2,14 +2,19 @@
 
 import argparse
 import datetime
+import difflib
 import importlib.metadata
+import json
+import os
+import re
 import subprocess
 import sys
+import textwrap
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
-from pipeline.nightly import commands as nights
 from pipeline.store import artifacts, params
 from pipeline.store.printable import printable
 from pipeline.temperature.settings import Plant
@@ -24,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def accept(_: argparse.Namespace) -> None:
-    """Mark the figures of this run as good: later reports show their differences against them."""
+    """The figures of this run become the reference: later reports show their differences against them."""
     from pipeline.report.shared.sources import machine
 
     metrics = {
@@ -90,16 +95,9 @@ def _shown() -> dict:
     }
 
 
-def screenshots(arguments: argparse.Namespace) -> None:
-    """Take the pictures of the README: page one and the viewer, as they are in reports/."""
-    from pipeline.report import screenshots as pictures
-
-    print(f"written: {', '.join(path.as_posix() for path in pictures.take(arguments.folder))}")
-
-
 def runs(arguments: argparse.Namespace) -> None:
-    """Write a page of two runs side by side: figures with bands, and parameters that differ. A and B are
-    commits, tags, branches or DVC experiments whose metrics git has."""
+    """A page of two runs side by side: figures with bands, and parameters that differ. A and B are commits,
+    tags, branches or DVC experiments whose metrics git has."""
     from pipeline.report.runs import commits
     from pipeline.report.runs import page as runs_page
     from pipeline.verdict.settings import ReportRules
@@ -114,8 +112,9 @@ def runs(arguments: argparse.Namespace) -> None:
 
 
 def inspect(arguments: argparse.Namespace) -> None:
-    """What is in a recording: signals, rates, jitter, gaps, ranges,
-    damage; and a mapping to paste into params.yaml."""
+    """The signals of a recording with units, rates, gaps and ranges, its damage, and a mapping to paste into
+    params.yaml."""
+    from pipeline.commands.inspection_json import as_json
     from pipeline.recordings.inspection import inspect as describe
     from pipeline.recordings.isolated import Budget, isolated
     from pipeline.recordings.plain_files import check_plain_file
@@ -124,37 +123,41 @@ def inspect(arguments: argparse.Namespace) -> None:
     declared = params.load(Ingest, "ingest", here)
     check_plain_file(arguments.file)
     budget = Budget(declared.longest_s, declared.largest_mb)
-    print(printable(isolated(describe, arguments.file, shown=arguments.file, budget=budget)))
+    form = as_json if arguments.json else describe
+    print(printable(isolated(form, arguments.file, shown=arguments.file, budget=budget)))
 
 
-def quick(arguments: argparse.Namespace) -> None:
-    """Write a first page to quick/: every loop at the sizes of params.quick.yaml,
-    with a classifier that git keeps. datasets/, reports/ and dvc.lock stay as they are."""
+def quick(_: argparse.Namespace) -> None:
+    """Every loop at the sizes of params.quick.yaml, with a classifier that git keeps. The pages go to quick/;
+    datasets/, reports/ and dvc.lock stay as they are."""
     from pipeline import quick as looking
 
-    print(printable(looking.keep() if arguments.keep else looking.quick()))
+    print(printable(looking.quick()))
 
 
 def init(arguments: argparse.Namespace) -> None:
-    """Recordings of a new machine into params.yaml: mapping, plant, panel and rules that fit its pace, the
-    loops that they serve; and what a person must still decide."""
+    """Mapping, signals, limits, test set and rules that fit the pace of the recorded machine, and the loops
+    that the recordings serve. It prints what a person must still decide."""
     from pipeline.commands import propose_params
 
     initialised = propose_params.proposed(arguments.recordings, sample_time=arguments.time)
     values = propose_params.loops_to_run(["temperature"]) | initialised.values
-    changed, edited = propose_params.write(values, force=arguments.force)
-    if arguments.copy:
+    dry_run = arguments.dry_run
+    changed, edited = propose_params.write(values, force=arguments.force, dry_run=dry_run)
+    copied = arguments.copy and not dry_run
+    if copied:
         propose_params.copy(arguments.recordings)
     initialised = initialised._replace(values=values)
+    if dry_run and changed:
+        print("dry run: nothing is written; what would be:")
     print(propose_params.summary(initialised, changed, edited, arguments.recordings, arguments.copy))
 
 
-def first_experiment(arguments: argparse.Namespace) -> None:
-    """An experiment for a machine of which there is no good record: for Klipper G-code of targets, for any
-    other machine a staircase of inputs with the temperatures at which to stop. No model is behind it."""
+def temperature_experiment(arguments: argparse.Namespace) -> None:
+    """An experiment for a machine without a good recording: G-code of targets if the temperatures come from
+    Klipper, else a staircase of inputs with the temperatures at which to stop. No model stands behind it."""
     from pipeline.commands import first_experiment as first
     from pipeline.temperature.settings import check_output_limits
-    from stages.ingest import Ingest
 
     machine = params.load(Plant, "plant")
     check_output_limits(machine, "recordings")
@@ -168,9 +171,19 @@ def first_experiment(arguments: argparse.Namespace) -> None:
     print(first.instructions(steps, str(arguments.out)))
 
 
+def setpoint_experiment(arguments: argparse.Namespace) -> None:
+    """The G-code of a print from which the classifier learns: one layer for each flow and temperature, with a
+    layer at 100 % between. A table beside it says which lines have which setting."""
+    from pipeline.commands import training_print as printing
+    from pipeline.commands.shadow.deploy import pixel
+
+    printed = printing.read(vars(arguments))
+    print(printing.write(printed, arguments.out, pixel(arguments.tip) if arguments.tip else None))
+
+
 def compose(arguments: argparse.Namespace) -> None:
-    """A part program into plunger commands (CSV, Parquet, MCAP, G-code with leads), tasks and lines as
-    Parquet, and whether it will print."""
+    """The plunger command of a part program, its tasks and lines as Parquet, and a forecast, line by line, of
+    whether it will print."""
     from pipeline.commands import compose as command
     from pipeline.deposition.parts.part_report import summary_lines
     from pipeline.deposition.settings import ComposeParts, Printer
@@ -179,7 +192,7 @@ def compose(arguments: argparse.Namespace) -> None:
     if arguments.out.exists() and not arguments.out.is_dir():
         raise ValueError(
             f"--out {arguments.out}: should be a folder but is a file; name a folder, "
-            "which is made where it is missing"
+            "which is made if it is missing"
         )
     request = command.request(
         scale=arguments.scale, speed=arguments.speed, filament_mm=arguments.filament_mm,
@@ -200,8 +213,8 @@ def compose(arguments: argparse.Namespace) -> None:
 
 
 def calibrate_tip(arguments: argparse.Namespace) -> None:
-    """A picture of the nozzle's camera into a page on which a click gives the
-    tip; with --tip, what the front end makes of it."""
+    """A page with a picture of the nozzle's camera. A click on it gives the tip. With --tip it shows what the
+    front end sees, or why it rejects the picture."""
     from pipeline.commands.calibrate_tip import calibrate
 
     sections = params.read()
@@ -219,8 +232,8 @@ def calibrate_tip(arguments: argparse.Namespace) -> None:
 
 
 def calibrate_camera(arguments: argparse.Namespace) -> None:
-    """Pictures of printed lines of known widths into section camera of params.yaml:
-    size of a pixel, rotation, measured columns, edge bias by width; and a page."""
+    """Section camera of params.yaml from pictures of printed lines of known widths: size of a pixel,
+    rotation, measured columns and edge bias; and a page."""
     from pipeline.commands import calibrate_camera as camera
 
     request = camera.CalibrationRequest(
@@ -229,19 +242,19 @@ def calibrate_camera(arguments: argparse.Namespace) -> None:
         camera.pixel(arguments.tip),
         arguments.pitch,
     )
-    out = arguments.out or Path(f"{arguments.images[0].stem}.camera.html")
+    out = Path(f"{arguments.images[0].stem}.camera.html")
     print(camera.calibrate(request, out, write=arguments.write))
 
 
 def shadow(arguments: argparse.Namespace) -> None:
-    """Watch a printer's camera: what the controller would do in each window and why,
-    as MCAP and a local page. Nothing is sent."""
+    """What the default controller would do in each window of frames, and why, as MCAP and as a page on this
+    machine. Nothing is sent."""
     from pipeline.commands.shadow import deploy
 
-    _watch(arguments, deploy.ready(str(arguments.levels or "")))
+    _watch(arguments, deploy.ready(""))
 
 
-def _watch(arguments: argparse.Namespace, ready: "Ready") -> None:
+def _watch(arguments: argparse.Namespace, ready: "Ready", *, in_json: bool = False) -> None:
     """Watches a source of frames with the loop that is ready."""
     from pipeline.commands import shadow as watching
     from pipeline.commands.shadow import deploy
@@ -253,18 +266,19 @@ def _watch(arguments: argparse.Namespace, ready: "Ready") -> None:
     )
     frames = source(arguments.source, ready.topics, rate_hz=deploy.bounded("--rate", arguments.rate))
     place = display_name(arguments.source)
-    print(f"{place}: {verdict(ready.deployed.proof)}", flush=True)
-    print(f"{place}: open {arguments.out / 'index.html'}; Ctrl-C ends the watch", flush=True)
+    if not in_json:
+        print(f"{place}: {verdict(ready.deployed.proof)}", flush=True)
+        print(f"{place}: open {arguments.out / 'index.html'}; Ctrl-C ends the watch", flush=True)
     with watching.until_told() as stopped:
         watched = watching.watch(frames, ready.deployed, asked, arguments.out, place=place, stopped=stopped)
     if watched.unreadable:
         raise ValueError(f"{place}: none of {watched.frames} frames can be read: {watched.unreadable}")
-    print(watching.summary_lines(watched, place))
+    print(json.dumps(watched._asdict(), default=str) if in_json else watching.summary_lines(watched, place))
 
 
-def record_levels(arguments: argparse.Namespace) -> None:
-    """Flows that were held for a minute each before a printer's camera into the correction for that camera,
-    and a page."""
+def calibrate_levels(arguments: argparse.Namespace) -> None:
+    """The correction of the classifier for another camera, from flows that were held for a minute each, and a
+    page. `shadow` uses it from then on."""
     from functools import partial
 
     from pipeline.commands import record_levels as levels
@@ -293,52 +307,28 @@ def record_levels(arguments: argparse.Namespace) -> None:
         eye.view.least_score, eye.digest, eye.view.false_alarms, material,
     )  # fmt: skip
     recorded, told = levels.record(source, protocol, levels_eye, place=str(place))
-    print(levels.write(recorded, told, arguments.out, str(place), material))
-
-
-def training_print(arguments: argparse.Namespace) -> None:
-    """The G-code of a print from which the classifier learns: flows and temperatures in steps,
-    with a layer at 100 % between; and a table of which setting holds from which line on."""
-    from pipeline.commands import training_print as printing
-    from pipeline.commands.shadow.deploy import pixel
-
-    def one(flag: str) -> float:
-        return printing.numbers(str(getattr(arguments, flag[2:].replace("-", "_"))), flag, 1)[0]
-
-    def pair(flag: str) -> tuple[float, float]:
-        x, y = printing.numbers(getattr(arguments, flag[2:]), flag, 2)
-        return x, y
-
-    asked = printing.TrainingPrint(
-        flows=printing.numbers(arguments.flows, "--flows"),
-        temperatures=printing.numbers(arguments.temperatures, "--temperatures"),
-        bed=pair("--bed"), height=one("--height"), size=pair("--size"), nozzle=one("--nozzle"),
-        layer=one("--layer"), filament=one("--filament"), speed=one("--speed"), travel=one("--travel"),
-        bed_temperature=one("--bed-temperature"), best_temperature=one("--best-temperature"),
-        melt=one("--melt"),
-    )  # fmt: skip
-    print(printing.write(asked, arguments.out, pixel(arguments.tip) if arguments.tip else None))
+    print(levels.write(recorded, told, Path("datasets/levels/levels.parquet"), str(place), material))
 
 
 def export(arguments: argparse.Namespace) -> None:
-    """A certified controller as C99 without heap, as one file of Python, or as settings for Klipper and
-    Kalico; what sees and decides in the setpoint loop as weights with readers that need numpy alone."""
+    """A certified controller as C99 without heap, as one file of Python, or as a module for Klipper and
+    Kalico. The camera loop is exported as weights with readers that need NumPy alone."""
     from pipeline.commands.export import export as write
 
     print(write(arguments.controller, arguments.to, arguments.out, arguments.section))
 
 
 def replay(arguments: argparse.Namespace) -> None:
-    """A recording, and what a certified controller would have asked on it and why not: as MCAP with a layout
-    for Foxglove, and a page. Frames of the nozzle's camera go through the loop of shadow with the classifier
-    and the filter of CONTROLLER. Nothing is sent."""
+    """What a certified controller would request on a recording, and why it would not, as MCAP with a layout
+    for Foxglove and as a page. Frames of the nozzle camera go through the loop of `shadow`. Nothing is
+    sent."""
     from pipeline.commands import export as exports
 
     if exports.shows_frames(arguments.controller):
         from pipeline.commands import replay_camera
 
         arguments.source, arguments.rate, arguments.once = str(arguments.recording), 5.0, True
-        _watch(arguments, replay_camera.ready(arguments.controller))
+        _watch(arguments, replay_camera.ready(arguments.controller), in_json=arguments.json)
         return
     from pipeline.commands import replay as replaying
     from pipeline.report.replay import page
@@ -351,8 +341,21 @@ def replay(arguments: argparse.Namespace) -> None:
         done.time_s, done.applied, done.asked, done.measured, done.reference, done.off, inputs, outputs, told
     )
     artifacts.write_text(arguments.out / "index.html", page.render(shown))
+    if arguments.json:
+        print(json.dumps(told))
+        return
     print(f"{arguments.recording}: {told['samples']} samples. {page.decision(told)}")
     print(f"written: {arguments.out}/index.html, replay.mcap, layout.json, replay.json")
+
+
+def nightly(arguments: argparse.Namespace) -> None:
+    """New recordings, dvc repro, comparison with production, then promote or keep: see reports/nightly.html.
+    A loop that fails keeps its controller; the others are judged."""
+    from pipeline.nightly import commands
+
+    status, sentence = commands.run(arguments, render_night)
+    print(printable(sentence), file=sys.stderr if status else sys.stdout)
+    sys.exit(status)
 
 
 def render_night(nights: "Sequence[Night]", state: "ChampionState", settings: "Nightly") -> str:
@@ -370,281 +373,359 @@ def version() -> str:
     return importlib.metadata.version("beadline")
 
 
-def _add_print(command: argparse.ArgumentParser) -> None:
-    """What frames may not say of the print."""
-    command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels of the frames")
-    command.add_argument(
-        "--flow", type=float, default=100.0, help="flow setpoint in %% where frames have none (100)"
-    )
-    command.add_argument(
-        "--temperature", type=float, default=210.0, help="of the nozzle in °C where frames have none (210)"
-    )
+# ---- the commands with their options
 
-
-def _add_shadow(commands: argparse._SubParsersAction) -> None:
-    command = commands.add_parser("shadow", help=shadow.__doc__, description=shadow.__doc__)
-    command.add_argument(
-        "source",
-        help="a folder that fills with pictures, an MCAP file that grows, or the address of a snapshot",
-    )
-    command.add_argument(
-        "--out", type=Path, default=Path("shadow"), metavar="DIR", help="for page and decisions (shadow)"
-    )
-    _add_print(command)
-    command.add_argument(
-        "--levels",
-        type=Path,
-        metavar="FILE",
-        help="of record-levels (datasets/levels/levels.parquet, if there)",
-    )
-    command.add_argument("--rate", type=float, default=5.0, metavar="HZ", help="snapshots a second (5)")
-    command.add_argument("--once", action="store_true", help="end where the source ends")
-    command.set_defaults(run=shadow)
-
-
-def _add_record_levels(commands: argparse._SubParsersAction) -> None:
-    command = commands.add_parser(
-        "record-levels", help=record_levels.__doc__, description=record_levels.__doc__
-    )
-    command.add_argument(
-        "source", type=Path, metavar="FOLDER|MCAP",
-        help="pictures, each of the time when its file was written, or a recording",
-    )  # fmt: skip
-    command.add_argument(
-        "--flows", default="60,80,100,125,160", metavar="PERCENT,...",
-        help="in the order in which they were held (60,80,100,125,160)",
-    )  # fmt: skip
-    command.add_argument(
-        "--hold",
-        type=float,
-        default=60.0,
-        metavar="S",
-        help="how long each was held, from the first frame on (60)",
-    )
-    command.add_argument(
-        "--settle",
-        type=float,
-        default=10.0,
-        metavar="S",
-        help="after each change, in which the melt follows (10)",
-    )
-    command.add_argument(
-        "--temperature", type=float, default=210.0, help="of the nozzle in °C where the source has none (210)"
-    )
-    command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels")
-    command.add_argument(
-        "--out", type=Path, default=Path("datasets/levels/levels.parquet"), metavar="FILE",
-        help="where shadow looks for it (datasets/levels/levels.parquet)",
-    )  # fmt: skip
-    command.set_defaults(run=record_levels)
-
-
-def _add_training_print(commands: argparse._SubParsersAction) -> None:
-    words = str(training_print.__doc__).replace("%", "%%")
-    command = commands.add_parser("training-print", help=words, description=words)
-    command.add_argument("out", type=Path, metavar="OUT.gcode", help="the table stands beside it")
-    for flag, default, metavar, words in (
-        ("--flows", "40,60,75,85,92,100,108,115,125,150,200", "PERCENT,...", "steps of the flow"),
-        ("--temperatures", "190,200,210,220,230", "DEGC,...", "steps of the nozzle's temperature"),
-        ("--bed", "220,220", "MM,MM", "the bed along x and y"),
-        ("--height", "250", "MM", "room above the bed"),
-        ("--size", "50,20", "MM,MM", "the cuboid along x and y"), ("--nozzle", "0.4", "MM", "its diameter"),
-        ("--layer", "0.2", "MM", "height of a layer"), ("--filament", "1.75", "MM", "its diameter"),
-        ("--speed", "20", "MM/S", "of lines"), ("--travel", "100", "MM/S", "between them"),
-        ("--bed-temperature", "60", "DEGC", "of the bed"),
-        ("--best-temperature", "210", "DEGC", "of the layers between"),
-        ("--melt", "12", "MM^3/S", "the most that the hot end melts"),
-    ):  # fmt: skip
-        command.add_argument(flag, default=default, metavar=metavar, help=f"{words} ({default})")
-    command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels, for the table")
-    command.set_defaults(run=training_print)
-
-
-def _add_runs(commands: argparse._SubParsersAction) -> None:
-    command = commands.add_parser("runs", help=runs.__doc__, description=runs.__doc__)
-    command.add_argument("a", metavar="A", help="the run before")
-    command.add_argument("b", metavar="B", help="the run after")
-    command.set_defaults(run=runs)
-
-
-def _add_export(commands: argparse._SubParsersAction) -> None:
-    command = commands.add_parser("export", help=export.__doc__, description=export.__doc__)
-    command.add_argument("controller", type=Path, metavar="CONTROLLER", help="a folder of export_controllers")
-    command.add_argument("--to", required=True, choices=("c", "python", "klipper"))
-    command.add_argument("--out", type=Path, metavar="DIR", help="(CONTROLLER/c, .../python, .../klipper)")
-    command.add_argument(
-        "--section", default="extruder", choices=("extruder", "heater_bed"), help="of printer.cfg (extruder)"
-    )
-    command.set_defaults(run=export)
-
-
-def _add_replay(commands: argparse._SubParsersAction) -> None:
-    command = commands.add_parser("replay", help=replay.__doc__, description=replay.__doc__)
-    command.add_argument("controller", type=Path, metavar="CONTROLLER", help="a folder of export_controllers")
-    command.add_argument(
-        "recording",
-        type=Path,
-        metavar="RECORDING",
-        help="CSV, Parquet, MCAP, klippy.log; of frames a folder of pictures or an MCAP",
-    )
-    command.add_argument("--out", type=Path, default=Path("replay"), metavar="DIR", help="(replay)")
-    command.add_argument(
-        "--reference", default="", metavar="DEGC,...", help="one an output, where the recording has none"
-    )
-    _add_print(command)
-    command.set_defaults(run=replay)
-
-
-# what stands behind ./run beadline COMMAND in the example of its --help
-EXAMPLES = {
-    "accept": "",
-    "screenshots": "",
-    "inspect": "log.csv",
-    "quick": "",
-    "init": "log.csv --copy",
-    "first-experiment": "--hold 200",
-    "compose": "part.gcode --as csv,gcode --out jobs",
-    "calibrate-tip": "frame.png --tip 320,240",
-    "calibrate-camera": "lines.png --widths 0.4,0.6,0.8 --pitch 3",
-    "shadow": "frames --once",
-    "record-levels": "frames --flows 60,80,100,125,160",
-    "training-print": "training.gcode",
-    "export": "datasets/export_controllers/temperature --to c",
-    "replay": "datasets/export_controllers/temperature log.csv",
-    "nightly": "",
-    "rollback": "night-0042",
-    "runs": "HEAD~1 HEAD",
+# group in --help -> command -> its line there
+GROUPS = {
+    "Start": {
+        "quick": "Make a first report from bundled data in minutes",
+        "init": "Write params.yaml for the recordings of a machine",
+    },
+    "Data": {
+        "inspect": "List signals, rates and damage of a recording",
+        "experiment": "Write an experiment or a training print to record",
+    },
+    "Parts": {"compose": "Compute the command that prints a part, with a forecast"},
+    "Camera": {
+        "calibrate": "Calibrate a camera: nozzle tip, line widths or flow",
+        "shadow": "Watch a nozzle camera and show each decision",
+    },
+    "Deploy": {
+        "export": "Write a certified controller as C, Python or for Klipper",
+        "replay": "Show what a controller would request on a recording",
+    },
+    "Runs": {
+        "accept": "Make this run the reference of later reports",
+        "runs": "Compare two runs on one page",
+        "nightly": "Learn from new recordings and promote what is better",
+    },
 }
-STATUSES = "0 done; 1 refused, and one sentence says why; 2 a wrong option"
-OTHER_STATUSES = {
-    "nightly": "0 promoted, kept or nothing new; 1 the night or one loop failed; 3 drift alarm; "
-    "4 recordings set aside; 75 another night is at work"
+# exit status -> meaning and what to do
+STATUSES = {
+    0: ("done", "nothing"),
+    1: ("refused; one sentence says why", "follow the sentence"),
+    2: ("wrong command or option", "see --help"),
+}
+NIGHTLY_STATUSES = {
+    0: ("promoted, kept, candidate stored, or nothing new", "nothing"),
+    1: ("the run, the push, or the stages of one loop failed", "read the summary or reports/nightly.html"),
+    3: ("drift alarm", "look at the machine; that loop is not promoted while the alarm lasts"),
+    4: ("done, but recordings were set aside", "repair them in datasets/quarantine and put them back"),
+    75: ("another nightly run is at work", "wait for it"),
 }
 
 
-def _tell(name: str, command: argparse.ArgumentParser) -> None:
+class Command(NamedTuple):
+    """A command: what it runs, an example of what stands behind its name, its arguments as `argument` returns
+    them, and its exit statuses."""
+
+    run: Callable[[argparse.Namespace], None]
+    example: str
+    arguments: tuple[tuple[tuple[str, ...], dict[str, Any]], ...] = ()
+    statuses: dict[int, tuple[str, str]] = STATUSES
+
+
+def argument(*names: str, **settings: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """What `ArgumentParser.add_argument` takes."""
+    return names, settings
+
+
+TIP = argument("--tip", default="", metavar="X,Y", help="nozzle tip in pixels of the pictures")
+FLOW = argument("--flow", type=float, default=100.0, help="flow setpoint in %% if the frames have none")
+NOZZLE = argument("--temperature", type=float, default=210.0, help="nozzle in °C if the frames have none")
+CONTROLLER = argument("controller", type=Path, metavar="CONTROLLER", help="folder of export_controllers")
+JSON = argument("--json", action="store_true", help="print JSON")
+COMMANDS = {
+    "quick": Command(quick, ""),
+    "init": Command(
+        init,
+        "log.csv --copy",
+        (
+            argument(
+                "recordings", type=Path, nargs="+", metavar="RECORDING", help="CSV, MCAP, klippy.log, ..."
+            ),
+            argument("--copy", action="store_true", help="copy them into datasets/raw/temperature"),
+            argument("--force", action="store_true", help="overwrite values that were edited"),
+            argument(
+                "--time", default="", metavar="'every 0.08 s'", help="sample time if the files have none"
+            ),
+            argument("--dry-run", action="store_true", help="write nothing; print what would be written"),
+        ),
+    ),
+    "inspect": Command(inspect, "log.csv", (argument("file", type=Path, help="a recording"), JSON)),
+    "experiment temperature": Command(
+        temperature_experiment,
+        "--hold 200",
+        (
+            argument("--minutes", type=float, default=60.0, help="length of the G-code"),
+            argument("--ramp", type=float, default=0.0, help="°C a minute of the targets; 0: no limit"),
+            argument("--hold", type=float, default=300.0, help="longest step of the inputs in seconds"),
+            argument(
+                "--out", type=Path, default=Path("first_experiment.csv"), metavar="FILE", help="the file"
+            ),
+        ),
+    ),
+    "experiment setpoint": Command(
+        setpoint_experiment,
+        "training.gcode",
+        (
+            argument(
+                "out", type=Path, metavar="OUT.gcode", help="the G-code; the table is written beside it"
+            ),
+            argument("--flows", default="40,60,75,85,92,100,108,115,125,150,200", help="flows in %%"),
+            argument("--temperatures", default="190,200,210,220,230", help="nozzle temperatures in °C"),
+            argument("--bed", default="220,220,250", metavar="MM,MM,MM", help="room along x, y and z"),
+            argument("--size", default="50,20", metavar="MM,MM", help="the cuboid along x and y"),
+            argument("--nozzle", default="0.4", metavar="MM", help="its diameter; layers are half as high"),
+            argument("--filament", default="1.75", metavar="MM", help="its diameter"),
+            argument("--bed-temperature", default="60", metavar="DEGC", help="of the bed"),
+            argument("--best-temperature", default="210", metavar="DEGC", help="of the layers between"),
+            argument(
+                "--melt", default="12", metavar="MM3/S", help="most that the hot end melts; limits speed"
+            ),
+            TIP,
+        ),
+    ),
+    "compose": Command(
+        compose,
+        "part.gcode --as csv,gcode --out jobs",
+        (
+            argument("part", type=Path, help="the part program (G-code)"),
+            argument("--out", type=Path, default=Path("."), help="folder for signal, tasks and report"),
+            argument(
+                "--as",
+                dest="formats",
+                default="csv",
+                metavar="csv,parquet,mcap,gcode",
+                help="formats of the command; gcode is for machines that play no signal",
+            ),
+            argument("--scale", type=float, default=1.0, help="X, Y and Z times this, and E's volume"),
+            argument("--speed", type=float, default=1.0, help="feeds times this"),
+            argument(
+                "--filament-mm", type=float, metavar="MM", help="diameter of what E pushes, if not stated"
+            ),
+            argument("--extruder", default="", metavar="WORD", help="what extrudes: E, U, 'M42 P4', ..."),
+            argument(
+                "--bead", choices=("e", "declared"), default="e", help="volume of a line by E or as declared"
+            ),
+            argument(
+                "--verify", action="store_true", help="also write the shortest print that tests the forecast"
+            ),
+        ),
+    ),
+    "calibrate tip": Command(
+        calibrate_tip,
+        "frame.png --tip 320,240",
+        (
+            argument("image", type=Path, help="a picture of the nozzle's camera"),
+            TIP,
+            argument("--out", type=Path, metavar="FILE", help="the page, else IMAGE.tip.html"),
+        ),
+    ),
+    "calibrate camera": Command(
+        calibrate_camera,
+        "lines.png --widths 0.4,0.6,0.8 --pitch 3",
+        (
+            argument(
+                "images", type=Path, nargs="+", metavar="PICTURE", help="one for each line, or one of all"
+            ),
+            argument("--widths", required=True, metavar="MM,MM,MM", help="of the lines, in their order"),
+            TIP,
+            argument(
+                "--pitch", type=float, default=float("nan"), metavar="MM", help="between lines of one picture"
+            ),
+            argument("--write", action="store_true", help="write the values into params.yaml"),
+        ),
+    ),
+    "calibrate levels": Command(
+        calibrate_levels,
+        "frames --flows 60,80,100,125,160",
+        (
+            argument("source", type=Path, metavar="FOLDER|MCAP", help="pictures of the held flows"),
+            argument("--flows", default="60,80,100,125,160", metavar="PERCENT,...", help="in their order"),
+            argument("--hold", type=float, default=60.0, metavar="S", help="how long each was held"),
+            argument("--settle", type=float, default=10.0, metavar="S", help="after each change, left out"),
+            NOZZLE,
+            TIP,
+        ),
+    ),
+    "shadow": Command(
+        shadow,
+        "frames --once",
+        (
+            argument("source", help="folder that fills, MCAP file that grows, or address of a snapshot"),
+            argument(
+                "--out", type=Path, default=Path("shadow"), metavar="DIR", help="for page and decisions"
+            ),
+            TIP,
+            FLOW,
+            NOZZLE,
+            argument("--rate", type=float, default=5.0, metavar="HZ", help="snapshots a second"),
+            argument("--once", action="store_true", help="end when the source ends"),
+        ),
+    ),
+    "export": Command(
+        export,
+        "datasets/export_controllers/temperature --to c",
+        (
+            CONTROLLER,
+            argument("--to", required=True, choices=("c", "python", "klipper"), help="the form"),
+            argument("--out", type=Path, metavar="DIR", help="the folder, else CONTROLLER/FORM"),
+            argument(
+                "--section", default="extruder", choices=("extruder", "heater_bed"), help="of printer.cfg"
+            ),
+        ),
+    ),
+    "replay": Command(
+        replay,
+        "datasets/export_controllers/temperature log.csv",
+        (
+            CONTROLLER,
+            argument(
+                "recording", type=Path, metavar="RECORDING", help="a log, or a folder or MCAP of frames"
+            ),
+            argument("--out", type=Path, default=Path("replay"), metavar="DIR", help="for page and signals"),
+            argument("--reference", default="", metavar="DEGC,...", help="of each output, if not recorded"),
+            TIP,
+            FLOW,
+            NOZZLE,
+            JSON,
+        ),
+    ),
+    "accept": Command(accept, ""),
+    "runs": Command(
+        runs,
+        "HEAD~1 HEAD",
+        (
+            argument("a", metavar="A", help="the earlier run"),
+            argument("b", metavar="B", help="the later run"),
+        ),
+    ),
+    "nightly": Command(
+        nightly,
+        "--dry-run",
+        (
+            argument("--watch", action="store_true", help="only check that the last success is recent"),
+            argument(
+                "--rollback",
+                nargs="?",
+                const="",
+                metavar="RUN",
+                help="put the controller of RUN, else the one before, back into production",
+            ),
+            argument(
+                "--accept-drift", nargs=2, metavar=("LOOP", "WHY"), help="take the drift of LOOP as intended"
+            ),
+            argument("--loop", default="", help="with --rollback: only this loop"),
+            argument("--dry-run", action="store_true", help="change nothing; print what would be done"),
+        ),
+        NIGHTLY_STATUSES,
+    ),
+}
+
+
+class Help(argparse.RawDescriptionHelpFormatter):
+    """Help that shows defaults and keeps the lines of examples."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        default = action.default
+        shown = (
+            action.option_strings and default is not argparse.SUPPRESS and default not in (None, "", False)
+        )
+        return (
+            f"{action.help or ''} (default: %(default)s)"
+            if shown and default == default
+            else action.help or ""
+        )
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that says which command or option is closest to a mistyped one."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(formatter_class=Help, **settings)
+
+    def error(self, message: str) -> NoReturn:
+        """Ends the process with status 2."""
+        if typed := re.search(r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)", message):
+            names = list(choices(self))
+            for word in sys.argv[1:]:
+                names += choices(self).get(word, self)._option_string_actions
+            nearest = difflib.get_close_matches(typed[1] or typed[2].partition("=")[0], names, 1)
+            message += f"; did you mean {nearest[0]}?" if nearest else ""
+        super().error(message)
+
+
+def choices(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """The commands of a parser by their names, those within a command too."""
+    actions = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    inner = {name: command for action in actions for name, command in action.choices.items()}
+    return inner | {name: one for command in inner.values() for name, one in choices(command).items()}
+
+
+def parser() -> argparse.ArgumentParser:
+    """Every command with its options."""
+    lines = [
+        f"{group}:\n" + "\n".join(f"  {name:<12}{line}" for name, line in commands.items())
+        for group, commands in GROUPS.items()
+    ]
+    parser = Parser(
+        prog="beadline",
+        usage="beadline COMMAND ...",
+        description="Turn recordings of an extrusion printer into controllers.\n\n" + "\n\n".join(lines),
+        epilog="beadline COMMAND --help shows the options of a command, an example and its exit statuses.",
+    )
+    parser.add_argument("--version", action="version", version=f"beadline {version()}")
+    commands = parser.add_subparsers(
+        required=True, metavar="COMMAND", prog="beadline", help=argparse.SUPPRESS
+    )
+    within = {}
+    for name in [name for commands in GROUPS.values() for name in commands]:
+        parts = [part for part in COMMANDS if part.split()[0] == name]
+        if parts != [name]:
+            command = commands.add_parser(name, description=f"{_line(name)}.", epilog=_ending(parts[0]))
+            within[name] = command.add_subparsers(required=True, metavar="WHAT")
+        for part in parts:
+            inner = within.get(name, commands)
+            about = " ".join(str(COMMANDS[part].run.__doc__).split()).replace("%", "%%")
+            command = inner.add_parser(
+                part.split()[-1],
+                help=about,
+                description=f"{_line(name)}.\n\n{textwrap.fill(about, 78)}",
+                epilog=_ending(part),
+            )
+            for names, settings in COMMANDS[part].arguments:
+                command.add_argument(*names, **settings)
+            command.set_defaults(run=COMMANDS[part].run)
+    return parser
+
+
+def _line(name: str) -> str:
+    return next(commands[name] for commands in GROUPS.values() if name in commands)
+
+
+def _ending(name: str) -> str:
     """Behind a command's options: an example and the exit statuses."""
-    example = f"./run beadline {name} {EXAMPLES.get(name, '')}".rstrip()
-    command.epilog = f"Example: {example} | Exit status: {OTHER_STATUSES.get(name, STATUSES)}"
+    statuses = "\n".join(f"  {code:<4}{meaning}" for code, (meaning, _) in COMMANDS[name].statuses.items())
+    example = f"./run beadline {name} {COMMANDS[name].example}".rstrip()
+    return f"Example: {example}\n\nExit status:\n{statuses}"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="beadline", description="Extrusion-printer recordings into controllers that can be trusted."
-    )
-    parser.add_argument("--version", action="version", version=f"beadline {version()}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    commands.add_parser("accept", help=accept.__doc__, description=accept.__doc__).set_defaults(run=accept)
-    _add_runs(commands)
-    command = commands.add_parser("screenshots", help=screenshots.__doc__, description=screenshots.__doc__)
-    command.add_argument("--folder", type=Path, default=Path("reports"), metavar="DIR", help="(reports)")
-    command.set_defaults(run=screenshots)
-    command = commands.add_parser("inspect", help=inspect.__doc__, description=inspect.__doc__)
-    command.add_argument("file", type=Path)
-    command.set_defaults(run=inspect)
-    command = commands.add_parser("quick", help=quick.__doc__, description=quick.__doc__)
-    command.add_argument(
-        "--keep", action="store_true", help="keep the classifier of this checkout's full run for it"
-    )
-    command.set_defaults(run=quick)
-    command = commands.add_parser("init", help=init.__doc__, description=init.__doc__)
-    command.add_argument("recordings", type=Path, nargs="+", metavar="RECORDING")
-    command.add_argument("--copy", action="store_true", help="copy them into datasets/raw/temperature")
-    command.add_argument("--force", action="store_true", help="overwrite values that were edited")
-    command.add_argument(
-        "--time",
-        default="",
-        metavar="'every 0.08 s'",
-        help="the sample time of recordings that do not say it",
-    )
-    command.set_defaults(run=init)
-    command = commands.add_parser(
-        "first-experiment", help=first_experiment.__doc__, description=first_experiment.__doc__
-    )
-    command.add_argument("--minutes", type=float, default=60.0, help="length of the G-code (60)")
-    command.add_argument(
-        "--ramp", type=float, default=0.0, help="°C a minute of the G-code's targets (0: none)"
-    )
-    command.add_argument(
-        "--hold", type=float, default=300.0, help="seconds of a step of inputs at most (300)"
-    )
-    command.add_argument("--out", type=Path, default=Path("first_experiment.csv"), metavar="FILE")
-    command.set_defaults(run=first_experiment)
-    command = commands.add_parser("compose", help=compose.__doc__, description=compose.__doc__)
-    command.add_argument("part", type=Path, help="the part program (G-code)")
-    command.add_argument("--out", type=Path, default=Path("."), help="folder for signal, tasks and report")
-    command.add_argument(
-        "--as",
-        dest="formats",
-        default="csv",
-        metavar="csv,parquet,mcap,gcode",
-        help="the commands' formats; gcode: with leads, for machines that play no signal (csv)",
-    )
-    command.add_argument(
-        "--scale", type=float, default=1.0, help="X, Y and Z times this, E's volume with them (1)"
-    )
-    command.add_argument("--speed", type=float, default=1.0, help="feeds times this (1)")
-    command.add_argument(
-        "--filament-mm",
-        type=float,
-        metavar="MM",
-        help="diameter of what E pushes; default: as the program says",
-    )
-    command.add_argument(
-        "--extruder", default="", metavar="WORD", help="what drives the extrusion: E, U, 'M42 P4', ..."
-    )
-    command.add_argument(
-        "--bead",
-        choices=("e", "declared"),
-        default="e",
-        help="volume of a line: by E where it counts, or the declared bead's (e)",
-    )
-    command.add_argument(
-        "--verify", action="store_true", help="also the shortest print that shows whether the forecast holds"
-    )
-    command.set_defaults(run=compose)
-    command = commands.add_parser(
-        "calibrate-tip", help=calibrate_tip.__doc__, description=calibrate_tip.__doc__
-    )
-    command.add_argument("image", type=Path, help="a frame of the nozzle's camera")
-    command.add_argument(
-        "--tip", default="", metavar="X,Y", help="the tip in pixels, from the left and from the top"
-    )
-    command.add_argument("--out", type=Path, metavar="FILE", help="the page; default IMAGE.tip.html here")
-    command.set_defaults(run=calibrate_tip)
-    command = commands.add_parser(
-        "calibrate-camera", help=calibrate_camera.__doc__, description=calibrate_camera.__doc__
-    )
-    command.add_argument(
-        "images", type=Path, nargs="+", metavar="PICTURE",
-        help="a picture or an MCAP recording for each line, or one picture of all lines",
-    )  # fmt: skip
-    command.add_argument(
-        "--widths", required=True, metavar="MM,MM,MM", help="the lines' widths in the order of the pictures"
-    )
-    command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels")
-    command.add_argument(
-        "--pitch", type=float, default=float("nan"), metavar="MM", help="distance of lines in one picture"
-    )
-    command.add_argument("--write", action="store_true", help="write the values into params.yaml")
-    command.add_argument(
-        "--out", type=Path, metavar="FILE", help="the page; default PICTURE.camera.html here"
-    )
-    command.set_defaults(run=calibrate_camera)
-    _add_shadow(commands)
-    _add_record_levels(commands)
-    _add_training_print(commands)
-    _add_export(commands)
-    _add_replay(commands)
-    nights.add(commands, render_night)
-    for name, command in commands.choices.items():
-        _tell(name, command)
-    arguments = parser.parse_args()
+    arguments = parser().parse_args()
     try:
         arguments.run(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:  # who reads our output has gone; Python would complain once more at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(CLOSED_PIPE)
     except (ValueError, OSError, MemoryError) as error:
         print(f"beadline: {printable(' '.join(artifacts.reason(error).split()))}", file=sys.stderr)
         sys.exit(1)
+
+
+# as of a process that SIGPIPE ends
+CLOSED_PIPE = 141
 
 
 if __name__ == "__main__":

@@ -3,18 +3,26 @@ those of the accepted run, and its commands exist."""
 
 import argparse
 import copy
+import doctest
+import importlib
+import importlib.util
+import json
 import re
 import runpy
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from pipeline import cli
 from pipeline.setpoint.agents import score
 from pipeline.store import artifacts
 from tests import readme
+from tests.recordings import klipper_machine
 
 LOOPS = ("temperature", "deposition", "setpoint")
 
@@ -77,37 +85,91 @@ def test_the_version_is_one_and_the_same_wherever_it_stands(root, monkeypatch, c
     assert re.findall(r"^## \[(.*?)\]", changes, re.MULTILINE)[:2] == ["Unreleased", version]
 
 
-def told(monkeypatch, capsys, *arguments: str) -> str:
-    """What the command prints with these arguments and --help."""
-    monkeypatch.setattr("sys.argv", ["beadline", *arguments, "--help"])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 0
-    return " ".join(capsys.readouterr().out.split())
+@pytest.fixture
+def beadline(monkeypatch, capsys):
+    """beadline("init", "--help"): status, what was printed, and what was said of errors."""
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["beadline", *arguments])
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as ended:
+            status = ended.code
+        return status, *capsys.readouterr()
+
+    return run
 
 
-def test_the_help_of_every_command_has_a_sentence_an_example_and_the_exit_statuses(monkeypatch, capsys):
-    names = re.findall(r"choose from|'([\w-]+)'", _choices(monkeypatch, capsys))
-    names = [name for name in names if name]
-    assert {"accept", "runs", "nightly", "export"} <= set(names) <= set(cli.EXAMPLES)
-    for name in names:
-        text = told(monkeypatch, capsys, name)
-        assert f"Example: ./run beadline {name} {cli.EXAMPLES[name]}".rstrip() in text, name
-        assert re.search(r"Exit status: 0 .*; 1 ", text), name
-        # its sentence stands between the usage and the options
-        assert re.search(r"\S[.:] (positional arguments|options):", text), (name, text)
+VERBS = {"Make", "Write", "List", "Compute", "Calibrate", "Watch", "Show", "Compare", "Learn"}
 
 
-def _choices(monkeypatch, capsys) -> str:
-    monkeypatch.setattr("sys.argv", ["beadline", "no-such-command"])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 2
-    return capsys.readouterr().err.split("choose from")[1]
+def test_help_has_twelve_commands_in_groups_and_each_line_begins_with_a_verb(beadline):
+    lines = {name: line for group in cli.GROUPS.values() for name, line in group.items()}
+    assert sorted(lines) == sorted({name.split()[0] for name in cli.COMMANDS}) and len(lines) == 12
+    assert {line.split()[0] for line in lines.values()} <= VERBS
+    assert all(len(line) <= 60 for line in lines.values())
+    status, text, _ = beadline("--help")
+    assert status == 0
+    for group, commands in cli.GROUPS.items():
+        assert f"{group}:\n" + "\n".join(f"  {name:<12}{line}" for name, line in commands.items()) in text
 
 
-def test_the_pictures_of_the_readme_are_those_that_the_command_takes(root):
-    from pipeline.report.screenshots import SHOTS
+@pytest.mark.parametrize("name", list(cli.COMMANDS))
+def test_the_help_of_a_command_has_an_example_exit_statuses_and_defaults(beadline, name):
+    status, text, _ = beadline(*name.split(), "--help")
+    plain = " ".join(text.split())
+    assert status == 0 and f"Example: ./run beadline {name} {cli.COMMANDS[name].example}".rstrip() in plain
+    assert re.search(r"Exit status: 0 .* 1 ", plain)
+    for names, settings in cli.COMMANDS[name].arguments:
+        if (
+            names[0].startswith("-")
+            and settings.get("default")
+            and settings["default"] == settings["default"]
+        ):
+            assert f"(default: {settings['default']})" in plain, names
+        assert settings["help"], names
+
+
+@pytest.mark.parametrize("name", ["calibrate", "experiment"])
+def test_the_help_of_a_command_of_several_parts_names_them_with_an_example(beadline, name):
+    status, text, _ = beadline(name, "--help")
+    assert status == 0 and f"Example: ./run beadline {name} " in text and "Exit status:\n  0   done" in text
+    listed = re.findall(r"^    (\w+)", text, re.MULTILINE)
+    assert listed == [part.split()[1] for part in cli.COMMANDS if part.startswith(f"{name} ")]
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        (["inspct", "log.csv"], "inspect"), (["calibrate", "cam"], "camera"),
+        (["init", "a.csv", "--coppy"], "--copy"),
+        (["nightly", "--roll-back"], "--rollback"), (["calibrate", "levels", "in", "--setle=3"], "--settle"),
+    ],
+)  # fmt: skip
+def test_a_mistyped_command_or_option_is_answered_with_the_closest_one(beadline, typed, meant):
+    status, out, wrong = beadline(*typed)
+    assert (status, out) == (2, "") and wrong.rstrip().endswith(f"; did you mean {meant}?")
+
+
+def test_what_is_like_no_command_is_answered_without_a_guess(beadline):
+    status, _, wrong = beadline("zzzzzz")
+    assert status == 2 and "did you mean" not in wrong and "choose from" in wrong
+
+
+def test_a_closed_pipe_ends_a_command_silently(root, tmp_path):
+    """Whoever reads closes at once, before the command has printed."""
+    (tmp_path / "log.csv").write_text("time_s,sensor\n" + "".join(f"{t},{t % 7}\n" for t in range(50)))
+    command = f"{sys.executable} -m pipeline.cli inspect {tmp_path}/log.csv; echo $? >&2"
+    with subprocess.Popen(
+        ["bash", "-c", command], cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as ran:
+        ran.stdout.close()
+        assert ran.stderr.read() == b"141\n"
+
+
+def test_the_pictures_of_the_readme_are_those_that_are_taken(root):
+    from tests.screenshots import SHOTS
 
     shown = re.findall(r"!\[[^\]]+\]\((reports/[^)]+)\)", (root / "README.md").read_text(encoding="utf-8"))
     assert shown == [f"reports/{shot.file}" for shot in SHOTS]
@@ -115,7 +177,7 @@ def test_the_pictures_of_the_readme_are_those_that_the_command_takes(root):
 
 
 def test_where_there_is_no_page_no_picture_is_taken(tmp_path):
-    from pipeline.report.screenshots import take
+    from tests.screenshots import take
 
     with pytest.raises(ValueError, match="index.html: expected the page, found none; run ./run dvc repro"):
         take(tmp_path)
@@ -257,5 +319,130 @@ def test_no_page_and_no_document_advises_to_deploy(root):
     pages = [*(root / "pipeline/report/templates").glob("*"), *(root / "docs").rglob("*"), root / "README.md"]
     advice = re.compile(r"(?<!pipeline/)\bdeploy\b", re.IGNORECASE)  # but for the folder of the code
     assert not [
-        path.name for path in pages if path.is_file() and advice.search(path.read_text(encoding="utf-8"))
+        path.name
+        for path in pages
+        if path.suffix in {".md", ".py", ".html", ".toml", ".css", ".js"}
+        and "_build" not in path.parts
+        and advice.search(path.read_text(encoding="utf-8"))
     ]
+
+
+# ---- the reference that the code itself states
+
+
+@pytest.fixture(scope="module")
+def generated(root):
+    """docs/generated.py; it needs no Sphinx."""
+    spec = importlib.util.spec_from_file_location("generated", root / "docs/generated.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_part_of_the_reference_has_a_place_on_a_page_and_every_place_a_part(root, generated):
+    pages = "".join(path.read_text(encoding="utf-8") for path in (root / "docs").rglob("*.md"))
+    places = re.findall(r"<!-- generated: ([\w ]+) -->", pages)
+    assert sorted(places) == sorted(generated.PARTS)
+    with pytest.raises(KeyError, match="no such part"):
+        generated.fill("<!-- generated: no such part -->")
+
+
+def test_the_reference_has_every_key_of_the_parameter_files(root, generated):
+    text = generated.parameters()
+    named = set(re.findall(r"^\| `([^`]+)`", text, re.MULTILINE))
+    for path in ("params.yaml", "params.expert.yaml"):
+        for section, values in yaml.safe_load((root / path).read_text(encoding="utf-8")).items():
+            for key in values:
+                assert any(re.match(rf"{section}\.{key}(\W|$)", name) for name in named), f"{section}.{key}"
+    assert "| `plant.sample_time_s` | s | number, > 0, ≤ 3600 | `1.0` |" in text
+    assert "Read by: `render_frames`, `train_classifier`" in text
+
+
+def test_the_reference_has_every_stage_command_and_word(root, generated):
+    stages = yaml.safe_load((root / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
+    assert re.findall(r"^## (\w+)$", generated.wiring(), re.MULTILINE) == list(stages)
+    commands = generated.commands()
+    assert all(f"## {name}\n" in commands for name in cli.COMMANDS)
+    assert "| `--rate` | snapshots a second | `5.0` |" in commands
+    assert "| 75 | another nightly run is at work | wait for it |" in generated.exit_codes()
+    assert "Disk margin\n  Change of gain and phase" in generated.glossary()
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_the_public_names_of_a_loop_are_there_explained_and_their_example_runs(loop):
+    package = importlib.import_module(f"pipeline.{loop}")
+    ran = doctest.testmod(package)
+    assert ran.failed == 0 and ran.attempted >= 8
+    for name in package.__all__:
+        value = getattr(package, name)
+        assert value.__doc__ or not callable(value), name
+    with pytest.raises(AttributeError, match=f"module 'pipeline.{loop}' has no attribute 'no_such_name'"):
+        package.no_such_name  # noqa: B018
+
+
+def test_a_package_of_public_names_loads_no_method(root):
+    code = "import sys; from pipeline import temperature, deposition, setpoint; print('numpy' in sys.modules)"
+    ran = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    assert ran.stdout == "False\n"
+
+
+# ---- the blocks of commands
+
+
+def blocks(root: Path) -> list[tuple[str, str, str]]:
+    """(page, what it needs, commands) of each block of commands of the documents."""
+    found = []
+    for path in sorted((root / "docs").rglob("*.md")):
+        text = path.read_text(encoding="utf-8")
+        for need, lines in re.findall(r"(?:<!-- needs: (.+?) -->\n)?```sh\n(.*?)```", text, re.DOTALL):
+            found.append((path.relative_to(root).as_posix(), need, lines))
+    return found
+
+
+def test_every_block_of_commands_runs_as_it_stands_or_names_what_it_needs(
+    root, beadline, tmp_path, monkeypatch
+):
+    """In a project that has nothing but the shipped files. A block with a need is only read, by the test of
+    commands and options."""
+    for name in ("params.yaml", "params.expert.yaml", "docs/tutorials/klippy.log"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes((root / name).read_bytes())
+    monkeypatch.chdir(tmp_path)
+    ran = []
+    for page, _, lines in [block for block in blocks(root) if not block[1]]:
+        for line in lines.splitlines():
+            words = shlex.split(line, comments=True)
+            assert words[:2] == ["./run", "beadline"], f"{page}: {line}: say what it needs"
+            status, said, wrong = beadline(*words[2:])
+            assert (status, wrong) == (0, ""), f"{page}: {line}: {wrong}"
+            ran.append((words[2], said))
+    assert [name for name, _ in ran] == ["inspect", "init", "init", "experiment"]
+    assert "extruder.temp" in ran[0][1] and "nothing is written" in ran[1][1] and "70 °C" in ran[3][1]
+    assert (tmp_path / "datasets/raw/temperature/klippy.log").exists() and (
+        tmp_path / "experiment.gcode"
+    ).exists()
+
+
+def test_the_log_of_the_tutorial_is_what_the_simulated_printer_writes(root):
+    targets = [(0, 0, 60), (60, 200, 60), (600, 215, 70), (900, 205, 65), (1200, 220, 75)]
+    made = klipper_machine.print_log(targets, longest_s=1250)
+    assert (root / "docs/tutorials/klippy.log").read_text(encoding="utf-8") == made
+
+
+def test_inspect_and_init_say_in_json_and_beforehand_what_they_would_say_and_write(
+    root, beadline, tmp_path, monkeypatch
+):
+    for name in ("params.yaml", "params.expert.yaml"):
+        (tmp_path / name).write_bytes((root / name).read_bytes())
+    monkeypatch.chdir(tmp_path)
+    log = str(root / "docs/tutorials/klippy.log")
+    looked = json.loads(beadline("inspect", log, "--json")[1])
+    signals = {signal["source"]: signal for signal in looked["signals"]}
+    assert looked["format"] == "klippy.log" and signals["extruder.pwm"]["largest"] == 100.0
+    assert {finding["kind"] for finding in looked["findings"]} == {"printed_file", "printer"}
+    assert yaml.safe_load(looked["proposed_yaml"])["plant"]["sample_time_s"] == 1.0
+    before = Path("params.yaml").read_bytes()
+    foretold = beadline("init", log, "--copy", "--dry-run")[1]
+    assert Path("params.yaml").read_bytes() == before and not Path("datasets").exists()
+    written = beadline("init", log, "--copy")[1]
+    assert foretold.splitlines()[1] == written.splitlines()[0] and Path("params.yaml").read_bytes() != before

@@ -1,6 +1,6 @@
-"""`beadline first-experiment`: an experiment from params.yaml alone, for an operator who stays beside it.
-There is no model, and so no forecast. A printer's firmware takes targets: it gets G-code of targets, which
-its own control follows. Any other machine gets a staircase of inputs.
+"""`beadline experiment temperature`: an experiment from params.yaml alone, for an operator who stays beside
+it. There is no model, and so no forecast. A printer's firmware takes targets: it gets G-code of targets,
+which its own control follows. Any other machine gets a staircase of inputs.
 """
 
 from collections.abc import Mapping

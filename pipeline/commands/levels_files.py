@@ -72,7 +72,7 @@ def restore_levels(path: str | Path, weights: str) -> RecordedLevels:
     if digest != weights:
         raise ValueError(
             f"{path} holds levels that another classifier saw ({digest[:8]}, the classifier is "
-            f"{weights[:8]}); record them again with ./run beadline record-levels, or remove the file"
+            f"{weights[:8]}); record them again with ./run beadline calibrate levels, or remove the file"
         )
     fitted = Levels(
         found["log_seen"],

@@ -375,10 +375,10 @@ def _questions_on_inputs(inputs: Sequence[Proposed]) -> list[str]:
 
 
 def write(
-    values: dict[str, list[str]], *, force: bool, path: str | Path = params.FILE
+    values: dict[str, list[str]], *, force: bool, dry_run: bool = False, path: str | Path = params.FILE
 ) -> tuple[list[str], list[str]]:
     """Writes the values into params.yaml and params.expert.yaml beside it; returns the keys that were
-    written, and those that a person edited.
+    written, and those that a person edited. With `dry_run` the keys are returned and nothing is written.
 
     A key that holds neither what was shipped nor what is written now was edited: without `force` it stays,
     and nothing is written, for the keys of a machine belong together.
@@ -395,7 +395,7 @@ def write(
                 text = replaced(text, dotted, lines)
             elif dotted == "plant.disturbances" and params.home("plant.inputs", path) == file:
                 text = inserted(text, dotted, lines)
-        if text != before:
+        if text != before and not dry_run:
             artifacts.write_text(file, text)
     return list(changes), []
 

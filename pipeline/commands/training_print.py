@@ -1,5 +1,5 @@
-"""`beadline training-print`: the G-code of a print from which the classifier learns, and which setting holds
-from which line on.
+"""`beadline experiment setpoint`: the G-code of a print from which the classifier learns, and which setting
+holds from which line on.
 
 A cuboid, as Li and Pattinson (2025) and CAXTON (Brion and Pattinson 2022) print them: each combination of
 flow (M221) and temperature (M109) has a layer of lines laid back and forth, and between two of these a layer
@@ -9,6 +9,7 @@ at 100 % and the best temperature, so that all are laid on the same ground.
 import csv
 import io
 import itertools
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,12 +20,15 @@ from pipeline.store import artifacts
 
 # least and largest of each flag, with its unit
 BOUNDS = {
-    "--bed": (60.0, 2000.0, "mm"), "--height": (10.0, 2000.0, "mm"), "--nozzle": (0.1, 2.0, "mm"),
-    "--layer": (0.04, 1.5, "mm"), "--filament": (1.0, 3.5, "mm"), "--speed": (1.0, 300.0, "mm/s"),
-    "--travel": (5.0, 500.0, "mm/s"), "--size": (10.0, 500.0, "mm"), "--bed-temperature": (0.0, 150.0,
-    "degC"), "--best-temperature": (150.0, 320.0, "degC"), "--temperatures": (150.0, 320.0, "degC"),
+    "--bed": (10.0, 2000.0, "mm"), "--nozzle": (0.1, 2.0, "mm"), "--filament": (1.0, 3.5, "mm"),
+    "--size": (10.0, 500.0, "mm"), "--bed-temperature": (0.0, 150.0, "degC"),
+    "--best-temperature": (150.0, 320.0, "degC"), "--temperatures": (150.0, 320.0, "degC"),
     "--flows": (*FLOW_LIMITS, "percent"), "--melt": (0.5, 200.0, "mm^3/s"),
 }  # fmt: skip
+# how many numbers a flag takes; one if it does not stand here, 0: any
+COUNTS = {"--bed": 3, "--size": 2, "--flows": 0, "--temperatures": 0}
+# mm/s of lines, if the hot end melts as much, and between them; height of a layer as a share of the nozzle
+SPEED, TRAVEL, LAYER = 20.0, 100.0, 0.5
 # of the lines: wider than the nozzle by this; layers of ground below the first setting; mm from the bed's
 # edge
 WIDER, GROUND, MARGIN = 1.2, 2, 5.0
@@ -40,8 +44,7 @@ COLUMNS = (
 
 class TrainingPrint(NamedTuple):
     """What is printed: flows in percent, temperatures in degC; bed (x, y) and height, size (x, y) of the
-    cuboid, nozzle, layer and filament in mm; speeds in mm/s; bed and best temperature in degC; melt: the most
-    that the hot end melts, mm^3/s."""
+    cuboid, nozzle, layer and filament in mm; speeds in mm/s; bed and best temperature in degC."""
 
     flows: tuple[float, ...]
     temperatures: tuple[float, ...]
@@ -55,7 +58,6 @@ class TrainingPrint(NamedTuple):
     travel: float
     bed_temperature: float
     best_temperature: float
-    melt: float
 
 
 class PrintLayer(NamedTuple):
@@ -94,6 +96,25 @@ def numbers(text: str, flag: str, count: int = 0) -> tuple[float, ...]:
     return values
 
 
+def read(options: Mapping[str, object]) -> TrainingPrint:
+    """The print that the command's options ask for, each a text. The lines are as fast as the hot end melts
+    at the largest flow. Raises ValueError, one sentence, for an option outside its bounds."""
+    found = {
+        flag: numbers(str(options[flag[2:].replace("-", "_")]), flag, COUNTS.get(flag, 1)) for flag in BOUNDS
+    }
+    x, y, height = found["--bed"]
+    across, along = found["--size"]
+    (nozzle,), (filament,), (melt,) = found["--nozzle"], found["--filament"], found["--melt"]
+    (bed,), (best,) = found["--bed-temperature"], found["--best-temperature"]
+    asked = TrainingPrint(
+        flows=found["--flows"], temperatures=found["--temperatures"], bed=(x, y), height=height,
+        size=(across, along), nozzle=nozzle, layer=LAYER * nozzle, filament=filament, speed=SPEED,
+        travel=TRAVEL, bed_temperature=bed, best_temperature=best,
+    )  # fmt: skip
+    most = melt / (_line_area(asked) * max(*asked.flows, 100.0) / 100.0)
+    return asked._replace(speed=min(SPEED, most))
+
+
 def check(asked: TrainingPrint) -> None:
     """Raises ValueError, one sentence, for what does not fit onto the bed or through the nozzle, and for
     settings of which nothing can be learned."""
@@ -103,29 +124,17 @@ def check(asked: TrainingPrint) -> None:
     count = len(asked.flows) * len(asked.temperatures)
     if count > MOST_SETTINGS:
         raise ValueError(f"expected at most {MOST_SETTINGS} settings, found {count}; print in two parts")
-    if asked.layer > 0.8 * asked.nozzle:
-        raise ValueError(
-            f"--layer: expected at most 0.8 of the nozzle's {asked.nozzle:g} mm, found {asked.layer:g}; "
-            "lay thinner layers"
-        )
     for axis, size, bed in zip("xy", asked.size, asked.bed, strict=True):
         if size + 2 * (ASIDE + 2 * MARGIN) > bed:
             raise ValueError(
                 f"--size: {size:g} mm along {axis} need a bed of {size + 2 * (ASIDE + 2 * MARGIN):g} mm with "
                 f"the nozzle's place to wait, found --bed {bed:g}; print a smaller cuboid"
             )
-    line = _line_area(asked)
-    most = asked.speed * line * max(*asked.flows, 100.0) / 100.0
-    if most > asked.melt:
-        raise ValueError(
-            f"--speed: {asked.speed:g} mm/s at {max(asked.flows):g} % ask for {most:.1f} mm^3/s where --melt "
-            f"says {asked.melt:g}; print at most {asked.speed * asked.melt / most:.1f} mm/s"
-        )
     top = _tops(asked)[-1] + LIFT
     if top > asked.height:
         raise ValueError(
-            f"the cuboid of {count} settings ends at {top:.1f} mm but --height is {asked.height:g}; ask for "
-            "fewer settings, or thinner layers"
+            f"the cuboid of {count} settings ends at {top:.1f} mm but --bed leaves {asked.height:g}; ask "
+            "for fewer settings"
         )
 
 

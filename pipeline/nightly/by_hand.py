@@ -12,9 +12,14 @@ from pipeline.nightly.worktree import COPY, Snapshot
 from pipeline.store import params
 
 
-def rollback(run: str, loop: str) -> str:
-    """Puts the champion of an earlier run back into production, bit by bit, and says what was done."""
+def rollback(run: str, loop: str, *, dry_run: bool = False) -> str:
+    """Puts the champion of an earlier run back into production, bit by bit, and says what was done. With
+    `dry_run` it says what would be done, and changes nothing."""
     params.load(Nightly, "nightly")
+    if dry_run:
+        earlier = champion.find_earlier(champion.read(), run, loop)
+        names = ", ".join(f"{name} would be {former.run}" for name, former in earlier.items())
+        return f"rollback, dry run: {names} again; nothing was changed"
     with _alone() as state:
         earlier = champion.find_earlier(state, run, loop)
         when = watch.stamp(datetime.datetime.now(datetime.UTC))

@@ -56,6 +56,24 @@ def nightly(render: reporting.Render, now: datetime.datetime | None = None) -> t
         return reporting.last_resort(error, started)
 
 
+def preview() -> str:
+    """What a run would do now, in a sentence: whether it has anything to learn from, and which recordings are
+    new. Changes nothing. Raises ValueError if a run would be refused."""
+    last = remembered.read()
+    night = Night(last.night + 1, f"night-{last.night + 1:04d}", "")
+    settings = _leave_out_loops(params.load(Nightly, "nightly"), copy.copy(last), night)
+    _check(settings)
+    digests = inputs.contents(inputs.Hashes(last.hashes), _list_places(settings))
+    if _is_known(digests, last):
+        return "nightly, dry run: no recording, parameter or code has changed; a run would do nothing"
+    _find_new(settings, last, digests, night)
+    new = [path for paths in night.new_recordings.values() for path in paths]
+    recordings = (
+        f"new recordings: {_name_few(new)}" if new else "no new recording; parameters or code changed"
+    )
+    return f"nightly, dry run: {recordings}; a run would learn and compare {', '.join(settings.loops)}"
+
+
 def _run(now: datetime.datetime, render: reporting.Render) -> tuple[int, str]:
     clock = time.monotonic()
     last, notes = remembered.read_or_set_aside()

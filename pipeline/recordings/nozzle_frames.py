@@ -71,7 +71,7 @@ REMEDIES = {
     REPEATED: "remove the lines that repeat others",
     COPY: "record again with a camera that runs, or remove the copies",
 }
-LOOK = "look at a few with ./run beadline calibrate-tip IMAGE --tip X,Y"
+LOOK = "look at a few with ./run beadline calibrate tip IMAGE --tip X,Y"
 ROWS_AT_ONCE = 10_000
 # what a printer can be told; beyond it the column is another one, or in another unit
 FLOW_PERCENT, TEMPERATURE_DEGC = (0.0, 1000.0), (0.0, 600.0)

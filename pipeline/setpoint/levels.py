@@ -59,7 +59,7 @@ def fit(windows: LevelWindows) -> Levels:
         raise ValueError(
             f"this camera does not see flow: expected windows that show more where more was commanded, found "
             f"{shown}, windows of one level {100 * within:.0f} % apart; look at a frame with "
-            "./run beadline calibrate-tip IMAGE --tip X,Y, and record again"
+            "./run beadline calibrate tip IMAGE --tip X,Y, and record again"
         )
     straight = _left_out(x, y, _line) <= _left_out(x, y, _pieces)
     at, value = (_line if straight else _pieces)(y, x)
@@ -129,7 +129,7 @@ def _summaries(windows: LevelWindows) -> tuple[np.ndarray, np.ndarray, np.ndarra
         raise ValueError(
             f"expected at least {LEAST_WINDOWS} windows that show a flow at {flows[k]:g} %, found "
             f"{usable[k]} of {count[k]}; hold it longer, or find out with "
-            "./run beadline calibrate-tip why frames are rejected"
+            "./run beadline calibrate tip why frames are rejected"
         )
     logs = [np.log(windows.seen[number & (windows.flow == flow)] / 100) for flow in flows]
     middle = np.array([np.median(values) for values in logs])

@@ -104,7 +104,7 @@ def test_it_says_why_it_abstains(folder, tmp_path):
 
 
 def test_a_still_log_is_replayed_and_its_page_says_what_cannot_be_told_and_links_nowhere(
-    folder, tmp_path, monkeypatch
+    folder, tmp_path, monkeypatch, capsys
 ):
     moving = rolled(9)
     noise = 0.1 * np.random.default_rng(3).standard_normal((T, 2))
@@ -118,6 +118,10 @@ def test_a_still_log_is_replayed_and_its_page_says_what_cannot_be_told_and_links
     assert (told["abstains"], told["notes"]) == (False, [support.STILL_TOLD])
     page = (out / "index.html").read_text()
     assert support.STILL_TOLD in page
+    capsys.readouterr()
+    monkeypatch.setattr(sys, "argv", [*argv, "--out", str(out), "--json"])
+    cli.main()
+    assert json.loads(capsys.readouterr().out) == told
     # it lies in a folder of its own, with no other page beside it
     assert re.findall(r'href="(?!data:|#)[^"]*"', page) == []
 

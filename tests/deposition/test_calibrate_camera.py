@@ -1,4 +1,4 @@
-"""`beadline calibrate-camera`: lines of known widths into params.yaml, whose other lines stay, and a page."""
+"""`beadline calibrate camera`: lines of known widths into params.yaml, whose other lines stay, and a page."""
 
 import functools
 import shutil
@@ -25,7 +25,7 @@ def calibrate(beadline, tmp_path):
     """calibrate("a.png", ...): status, what was printed, and what was said of errors."""
     for name in (params.FILE, params.EXPERT):
         shutil.copy(ROOT / name, tmp_path)
-    return functools.partial(beadline, "calibrate-camera")
+    return functools.partial(beadline, "calibrate", "camera")
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,8 @@
 
     ./run --group dev python -m tests.klipper.owner --seeds 901-920
 
-Nothing is edited by hand: the log of an evening's print, `init`, the experiment of `first-experiment` printed
-from the virtual SD card, the stages, and the exported files as they are written, in both firmwares.
+Nothing is edited by hand: the log of an evening's print, `init`, the experiment of `experiment temperature`
+printed from the virtual SD card, the stages, and the exported files as they are written, in both firmwares.
 """
 
 import argparse
@@ -95,7 +95,7 @@ def make(tree: trees.Tree, folder: Path, printer: Printer) -> dict[str, Any]:
     log = str((rig / "klippy.log").resolve())
     try:
         toy_temperature.beadline(project, "init", log, "--copy")
-        said = toy_temperature.beadline(project, "first-experiment")
+        said = toy_temperature.beadline(project, "experiment", "temperature")
         found["experiment"] = said.splitlines()[0]
         shutil.copy(project / "first_experiment.gcode", rig / "gcodes/experiment.gcode")
         out = trees.play(tree, rig, [["print", "experiment.gcode"]], start_s=1e5, **options)

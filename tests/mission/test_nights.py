@@ -61,7 +61,7 @@ def test_a_night_promotes_what_is_better_keeps_what_is_not_and_rolls_back(toy):
     worse = toy.night()
     assert worse.returncode == 0 and "kept" in worse.stdout
     assert toy.production() == second
-    back = toy.beadline("rollback")
+    back = toy.beadline("nightly", "--rollback")
     assert back.returncode == 0
     assert toy.production() == first
 

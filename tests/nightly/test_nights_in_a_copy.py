@@ -184,6 +184,17 @@ def test_a_worse_challenger_changes_the_run_and_not_production(project):
     assert project.dirty() == []
 
 
+def test_a_dry_run_names_what_is_new_and_changes_nothing(project):
+    idle = project.beadline("nightly", "--dry-run")
+    assert (idle.returncode, idle.stderr) == (0, "") and "a run would do nothing" in idle.stdout
+    project.record("new", [9.0, 9.0])
+    files = project.run("git", "status", "--porcelain").stdout
+    new = project.beadline("nightly", "--dry-run")
+    assert "new recordings: " in new.stdout and "new" in new.stdout.split("recordings: ")[1]
+    assert "learn and compare toy" in new.stdout
+    assert project.run("git", "status", "--porcelain").stdout == files
+
+
 def test_rollback_goes_back_bit_by_bit_and_what_was_rolled_back_does_not_return(project):
     one = project.production()
     project.record("better", [9.5, 9.5])
@@ -192,6 +203,10 @@ def test_rollback_goes_back_bit_by_bit_and_what_was_rolled_back_does_not_return(
     project.record("best", [9.0])
     run()
     assert len({str(files) for files in (one, two, project.production())}) == 3
+    before = project.run("git", "rev-parse", "HEAD").stdout
+    foretold = project.beadline("nightly", "--rollback", "--dry-run")
+    assert foretold.stdout == "rollback, dry run: toy would be night-0002 again; nothing was changed\n"
+    assert project.run("git", "rev-parse", "HEAD").stdout == before
     assert by_hand.rollback("", "").startswith("rollback: toy is night-0002 again")
     assert project.production() == two
     by_hand.rollback("", "")

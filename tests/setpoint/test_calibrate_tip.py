@@ -1,4 +1,4 @@
-"""`beadline calibrate-tip`: the page, what it says of a frame, and a click in a real browser."""
+"""`beadline calibrate tip`: the page, what it says of a frame, and a click in a real browser."""
 
 import functools
 import re
@@ -22,7 +22,7 @@ def declare(least_score: float | str) -> None:
 def calibrate(beadline):
     """calibrate("a.png", "--tip", "1,2"): status, what was printed, and what was said of errors."""
     declare(LEAST)
-    return functools.partial(beadline, "calibrate-tip")
+    return functools.partial(beadline, "calibrate", "tip")
 
 
 @pytest.fixture

@@ -159,7 +159,7 @@ def test_labels_that_contradict_the_flow_are_reported_and_the_flow_is_taken(copy
         (
             "nozzle_tip_y",
             "no tip is known, the first line 2, print0/image-0.png; "
-            "find it with ./run beadline calibrate-tip",
+            "find it with ./run beadline calibrate tip",
         ),
     ],
 )
@@ -188,7 +188,7 @@ def test_a_tip_that_is_no_place_in_the_picture_leaves_out_its_line(copy, tip):
     found = read(copy)
     assert not found.valid[4]
     assert "1 of 18 frames were left out: " in notes(found)
-    assert "calibrate-tip" in notes(found)
+    assert "calibrate tip" in notes(found)
     np.testing.assert_array_equal(np.delete(found.images, 4, 0), np.delete(expected(), 4, 0))
 
 
@@ -271,7 +271,7 @@ def test_a_link_to_nowhere_is_refused_by_its_name(copy):
 
 
 def test_a_folder_without_one_usable_frame_is_refused_with_the_reason(copy):
-    assert "the tip of these pictures with ./run beadline calibrate-tip" in refusal(copy, tip=(900.0, 100.0))
+    assert "the tip of these pictures with ./run beadline calibrate tip" in refusal(copy, tip=(900.0, 100.0))
     for name in ("print0", "print1"):
         shutil.rmtree(copy / name)
     said = refusal(copy)

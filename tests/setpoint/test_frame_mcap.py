@@ -329,7 +329,7 @@ def test_frames_without_a_usable_tip_are_refused_with_the_command(tmp_path):
     film(tmp_path / "raw/a.mcap", tip_x_px=None, tip_y_px=None)
     assert (
         f"a.mcap: {COUNT} of {COUNT} frames were left out: no tip is known, the first 0.000 s; "
-        "find it with ./run beadline calibrate-tip" in refusal(tmp_path / "raw")
+        "find it with ./run beadline calibrate tip" in refusal(tmp_path / "raw")
     )
     assert "(400, 10)" in refusal(tmp_path / "raw", tip=(400, 10))
 

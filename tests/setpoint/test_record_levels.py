@@ -1,4 +1,4 @@
-"""`beadline record-levels`: recordings of a camera that shows flow in its own way, in folders and as MCAP,
+"""`beadline calibrate levels`: recordings of a camera that shows flow in its own way, in folders and as MCAP,
 and such as do not suffice. What reads key areas is a rule on the bead's width."""
 
 import re

@@ -1,5 +1,5 @@
-"""`beadline training-print`: the program is read back by the project's own reader of G-code, and by nothing
-that wrote it."""
+"""`beadline experiment setpoint`: the program is read back by the project's own reader of G-code, and by
+nothing that wrote it."""
 
 import csv
 import sys
@@ -20,7 +20,7 @@ def printed(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
 
     def command(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["beadline", "training-print", "a.gcode", *arguments])
+        monkeypatch.setattr(sys, "argv", ["beadline", "experiment", "setpoint", "a.gcode", *arguments])
         status = 0
         try:
             cli.main()
@@ -83,7 +83,7 @@ def test_the_volume_is_that_of_the_cuboid_times_the_flow(printed):
 
 
 def test_nothing_leaves_the_bed_nor_drags_through_what_was_laid(printed):
-    printed(*FEW, "--bed", "80,90", "--height", "30")
+    printed(*FEW, "--bed", "80,90,30")
     moves = gcode.parse(Path("a.gcode").read_text()).moves
     after_home = moves.line > 12
     for axis, room in enumerate((80.0, 90.0, 30.0)):
@@ -110,6 +110,16 @@ def test_a_layer_after_too_much_lies_higher(printed):
     tops = [moves.end[moves.line == int(row["line_to"]) - 2, 2][0] for row in rows]
     rise = dict(zip([row["flow_rate"] for row in rows], np.diff([*tops, np.nan]), strict=True))
     assert rise["300"] == pytest.approx(0.6)
+
+
+def test_lines_are_as_fast_as_the_hot_end_melts_at_the_largest_flow(printed):
+    speeds = {}
+    for melt in ("12", "2"):
+        printed(*FEW, "--melt", melt)
+        moves = gcode.parse(Path("a.gcode").read_text()).moves
+        speeds[melt] = np.unique(moves.feed[moves.kind == Kind.EXTRUDE]).tolist()
+    line = (1.2 * 0.4 - 0.2 * (1 - np.pi / 4)) * 0.2
+    assert speeds == {"12": [20.0], "2": [pytest.approx(2 / (1.6 * line), abs=1e-3)]}
 
 
 def test_the_table_becomes_a_log_that_the_folder_reads(printed):
@@ -139,10 +149,10 @@ def test_the_same_flags_give_the_same_bytes(printed):
         (["--flows", "10,100"], "--flows: expected numbers from 20 to 310 percent, with commas between"),
         (["--flows", "a"], "found 'a'"), (["--flows", ""], "found ''"), (["--flows", "nan"], "found 'nan'"),
         (["--flows", "50,50"], "found one twice"), (["--temperatures", "20"], "150 to 320 degC"),
-        (["--bed", "220"], "--bed: expected 2 numbers"), (["--bed", "80,220", "--size", "70,20"], "along x"),
-        (["--nozzle", "0.2"], "--layer: expected at most 0.8 of the nozzle's 0.2 mm"),
-        (["--speed", "100", "--flows", "300"], "26.2 mm^3/s where --melt says 12; print at most 45.8 mm/s"),
-        (["--height", "20"], "ends at 26.4 mm but --height is 20"), (["--tip", "3"], "--tip: expected two"),
+        (["--bed", "220"], "--bed: expected 3 numbers"),
+        (["--bed", "80,220,250", "--size", "70,20"], "along x"),
+        (["--bed", "220,220,20"], "ends at 26.4 mm but --bed leaves 20"),
+        (["--tip", "3"], "--tip: expected two"),
         (["--filament", "0.5"], "--filament: expected one number from 1 to 3.5 mm"),
     ],
 )  # fmt: skip

@@ -1,4 +1,5 @@
-"""`beadline shadow` and `beadline record-levels` as a person types them, on what the stages leave behind."""
+"""`beadline shadow` and `beadline calibrate levels` as a person types them, on what the stages leave
+behind."""
 
 import contextlib
 import json
@@ -195,7 +196,7 @@ def test_levels_of_this_camera_are_used_and_those_of_another_classifier_are_not(
 def test_a_classifier_that_learned_nothing_sees_no_flow(command, trained):
     camera(200)
     status, said, wrong = command(
-        "record-levels", "in", "--tip", f"{TIP[0]:g},{TIP[1]:g}", "--hold", "5", "--settle", "0"
+        "calibrate", "levels", "in", "--tip", f"{TIP[0]:g},{TIP[1]:g}", "--hold", "5", "--settle", "0"
     )
     assert (status, said, len(wrong.splitlines())) == (1, "", 1)
     assert not Path(LEVELS_FILE).exists()
@@ -204,7 +205,7 @@ def test_a_classifier_that_learned_nothing_sees_no_flow(command, trained):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["shadow", "in"], "datasets/"), (["record-levels", "in"], "datasets/"),
+        (["shadow", "in"], "datasets/"), (["calibrate", "levels", "in"], "datasets/"),
     ],
 )  # fmt: skip
 def test_before_the_stages_have_run_it_says_which_to_run(command, arguments, said):
@@ -220,11 +221,10 @@ def test_before_the_stages_have_run_it_says_which_to_run(command, arguments, sai
         (["shadow", "in", "--temperature", "nan"], "--temperature: expected 0 to 600, found nan"),
         (["shadow", "in", "--rate", "0"], "--rate: expected 0.05 to 100"),
         (["shadow", "in", "--tip", "1"], "--tip: expected two numbers"),
-        (["shadow", "in", "--levels", "none.parquet"], "none.parquet is missing"),
         (["shadow", "http://u:secret@/"], "expected the address of a snapshot"),
-        (["record-levels", "none"], "none is missing; name the folder"),
-        (["record-levels", "in", "--hold", "1"], "--hold: expected 5 to 3600"),
-        (["record-levels", "in", "--flows", "a"], "--flows: expected numbers"),
+        (["calibrate", "levels", "none"], "none is missing; name the folder"),
+        (["calibrate", "levels", "in", "--hold", "1"], "--hold: expected 5 to 3600"),
+        (["calibrate", "levels", "in", "--flows", "a"], "--flows: expected numbers"),
     ],
 )  # fmt: skip
 def test_bad_flags_are_one_sentence(command, trained, arguments, said):

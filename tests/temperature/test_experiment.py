@@ -296,7 +296,7 @@ def test_a_target_in_the_middle_of_the_limits_is_found():
 
 
 def test_a_first_experiment_is_a_staircase_with_stops_below_the_limits(tree, monkeypatch, capsys):  # noqa: F811
-    monkeypatch.setattr(sys, "argv", ["beadline", "first-experiment", "--hold", "120"])
+    monkeypatch.setattr(sys, "argv", ["beadline", "experiment", "temperature", "--hold", "120"])
     cli.main()
     text = capsys.readouterr().out
     assert "nobody has forecast" in text and "Stop at: sensor_1 187.5 °C" in text
@@ -310,7 +310,7 @@ def test_a_first_experiment_is_a_staircase_with_stops_below_the_limits(tree, mon
 def test_without_declared_limits_there_is_no_first_experiment(tree, monkeypatch, capsys):  # noqa: F811
     text = (tree / "params.yaml").read_text().replace("reference: 150, low: 0, high: 250", "reference: 150")
     (tree / "params.yaml").write_text(text)
-    monkeypatch.setattr(sys, "argv", ["beadline", "first-experiment"])
+    monkeypatch.setattr(sys, "argv", ["beadline", "experiment", "temperature"])
     with pytest.raises(SystemExit):
         cli.main()
     assert "plant.outputs: sensor_1 should have low and high" in capsys.readouterr().err

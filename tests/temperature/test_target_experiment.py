@@ -91,7 +91,7 @@ def test_a_printer_gets_gcode_from_the_command(tmp_path, monkeypatch, capsys):
         },
     )
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "argv", ["beadline", "first-experiment", "--minutes", "30"])
+    monkeypatch.setattr(sys, "argv", ["beadline", "experiment", "temperature", "--minutes", "30"])
     cli.main()
     assert "30 min; hottest target of extruder 220 °C." in capsys.readouterr().out
     assert played((folder / "first_experiment.gcode").read_text())[-1][0] == pytest.approx(1800, abs=5)

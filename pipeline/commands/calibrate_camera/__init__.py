@@ -1,4 +1,4 @@
-"""`beadline calibrate-camera`: pictures of printed lines of known widths into section `camera` of
+"""`beadline calibrate camera`: pictures of printed lines of known widths into section `camera` of
 params.yaml, and a page that shows what was measured in them.
 """
 
@@ -287,7 +287,7 @@ def _page(request: CalibrationRequest, done: Calibrated, lines: Sequence[str]) -
     )
     images = " ".join(shlex.quote(str(path)) for path in request.images)
     widths = ",".join(f"{width:g}" for width in request.widths_mm)
-    command = json.dumps(f"./run beadline calibrate-camera {images} --widths {widths} --tip ")
+    command = json.dumps(f"./run beadline calibrate camera {images} --widths {widths} --tip ")
     values = {
         "name": html.escape(", ".join(path.name for path in request.images)),
         "picture": _embedded(first if first.dtype == np.uint8 else (first >> 8).astype(np.uint8)),

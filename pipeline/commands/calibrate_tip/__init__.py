@@ -1,4 +1,4 @@
-"""`beadline calibrate-tip`: one page, for any browser, on which a click shows where the nozzle's tip is, and
+"""`beadline calibrate tip`: one page, for any browser, on which a click shows where the nozzle's tip is, and
 what the front end makes of a frame with that tip."""
 
 import base64
@@ -37,7 +37,7 @@ def calibrate(image: Path, out: Path, tip: str, *, least_score: float, topic: st
     shown = "" if tip_px is None else _front_end(frame, tip_px, area, least_score)
     start = "null" if tip_px is None else json.dumps(list(tip_px))
     height, width = frame.shape
-    command = json.dumps(f"./run beadline calibrate-tip {shlex.quote(str(image))} --tip ").replace(
+    command = json.dumps(f"./run beadline calibrate tip {shlex.quote(str(image))} --tip ").replace(
         "<", "\\u003c"
     )
     values = {

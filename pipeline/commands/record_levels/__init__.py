@@ -1,4 +1,4 @@
-"""`beadline record-levels`: a few flows, held for a minute each before a camera, become the correction of
+"""`beadline calibrate levels`: a few flows, held for a minute each before a camera, become the correction of
 what its windows show; and a page beside it."""
 
 import html

@@ -164,7 +164,7 @@ def _remedy(night: Night, drifted: Sequence[str]) -> str:
         records.PROMOTED: (
             f"To put it into production: git merge {night.branch}; the next night brings it."
             if night.branch
-            else "To go back: ./run beadline rollback."
+            else "To go back: ./run beadline nightly --rollback."
         ),
     }.get(night.outcome, "")
     if not night.drift.quarantined:

@@ -146,7 +146,7 @@ def _step(verdict: Verdict) -> dict[str, str]:
     if verdict.rehearsal:
         return step(
             "Film the training print; frames go to datasets/raw/setpoint.",
-            "./run beadline training-print training.gcode",
+            "./run beadline experiment setpoint training.gcode",
         )
     if verdict.state == PASSED:
         return step("Watch a print without steering it.", "./run beadline shadow FRAMES")

@@ -127,7 +127,7 @@ def _step(sources: Sources, verdict: Verdict) -> dict[str, str]:
             f"{count(unrecorded, 'print')} are not recorded.",
             "./run beadline init klippy.log --copy --force",
         )
-    return step("Record the next experiment.", "./run beadline first-experiment")
+    return step("Record the next experiment.", "./run beadline experiment temperature")
 
 
 @or_gap

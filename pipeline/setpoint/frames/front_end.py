@@ -16,8 +16,8 @@ IN_A_ROW = 20
 FILLED_BITS = 12
 NO_TIP, UNUSABLE, SEVERAL = "no tip is known", "the frame cannot be used", "several lines"
 REMEDIES = {
-    NO_TIP: "find it with ./run beadline calibrate-tip IMAGE, and set tip_px in params.yaml",
-    UNUSABLE: "find the tip of these pictures with ./run beadline calibrate-tip IMAGE, and set tip_px in "
+    NO_TIP: "find it with ./run beadline calibrate tip IMAGE, and set tip_px in params.yaml",
+    UNUSABLE: "find the tip of these pictures with ./run beadline calibrate tip IMAGE, and set tip_px in "
     "params.yaml",
     SEVERAL: "write travel_direction_deg, the way the line leaves the tip in the picture, beside the frames, "
     "or take frames at 10 a second and more, in which the motion can be seen",

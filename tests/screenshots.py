@@ -1,5 +1,5 @@
 """Pictures of page one and of the viewer for the README, taken of the pages as they are in a headless
-Chromium."""
+Chromium: `./run --group dev python -m tests.screenshots`, after a run."""
 
 import shutil
 from pathlib import Path
@@ -28,7 +28,7 @@ def take(folder: Path) -> list[Path]:
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         raise ValueError(f"expected one of {', '.join(BROWSERS)}, found none; install Chromium")
-    # a package of the development group, which only this command needs
+    # a package of the group dev
     from playwright.sync_api import sync_playwright
 
     taken = []
@@ -46,3 +46,7 @@ def take(folder: Path) -> list[Path]:
             taken.append(folder / shot.file)
         started.close()
     return taken
+
+
+if __name__ == "__main__":
+    print("written:", *take(Path("reports")))
