@@ -35,7 +35,7 @@ LOOPS = {
         "PI, LQG, VARX + Riccati, learned kernel",
     ),
     "deposition": (
-        "**[Deposition](docs/how-to/deposition.md)**: flow of a plunger extruder",
+        "**[Deposition](docs/explanation/deposition.md)**: flow of a plunger extruder",
         "camera video, gantry and plunger position",
         "a plunger command for any G-code part, with a forecast",
         "on-off control, learned signal library, basis functions",
