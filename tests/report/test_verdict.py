@@ -343,7 +343,7 @@ def test_the_deciding_case_is_told_and_the_verdict_without_it():
     stages = metrics()
     assert (
         deciding_sentence(stages, "subspace_lqg")
-        == "Deciding case: plant 3, a ramp. Without plant 3 the same."
+        == "Deciding case: plant 3, a ramp. Without plant 3 the verdict is the same."
     )
     stages["evaluate_temperature"]["deciding"] |= {"best_without": "pi", "pair_without": None}
     assert deciding_sentence(stages, "subspace_lqg") == (

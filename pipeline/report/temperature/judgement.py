@@ -158,7 +158,7 @@ def deciding_sentence(figures: Figures, winner: str | None) -> str:
         changes.append(
             f"the pair would go to {in_a_sentence(other)}" if other else "the pair would be undecided"
         )
-    without = " and ".join(changes) if changes else "the same"
+    without = " and ".join(changes) if changes else "the verdict is the same"
     return f"Deciding case: plant {plant}{kind}. Without plant {plant} {without}."
 
 
