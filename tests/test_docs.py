@@ -19,6 +19,7 @@ import pytest
 import yaml
 
 from pipeline import cli
+from pipeline.recordings import isolated
 from pipeline.setpoint.agents import score
 from pipeline.store import artifacts
 from tests import readme
@@ -91,6 +92,8 @@ def beadline(monkeypatch, capsys):
 
     def run(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr("sys.argv", ["beadline", *arguments])
+        # a command has children of its own, in its own folder
+        monkeypatch.setattr(isolated, "_waiting", [])
         status = 0
         try:
             cli.main()
