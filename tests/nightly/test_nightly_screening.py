@@ -239,7 +239,7 @@ def test_each_night_of_the_champion_is_held_against_a_model_identified_without_i
         [tuple(np.column_stack([one[f"{kind}_1"], one[f"{kind}_2"]]) for kind in ("heater", "sensor"))]
         for one in shifts
     ]
-    models = temperature_drift._without_each(params.load(Plant, "plant"), segments)
+    models = temperature_drift._without_each(params.load(Plant, "plant"), segments, 600)
     # nights share models: 0 and 4, 1 and 5
     assert len(models) == 6 and models[0] is models[4] and models[1] is models[5]
     first = [float(one["sensor_1"][0]) for one in shifts]
