@@ -1,5 +1,6 @@
 """git and dvc as they are, run as children of the night."""
 
+import ctypes
 import json
 import os
 import shlex
@@ -7,13 +8,14 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
 STATE = Path(".beadline")
-# in the environment of every child, so that the next night finds what a killed one left running
-TOKEN = "BEADLINE_NIGHT"
+PR_SET_PDEATHSIG = 1  # of prctl
 FULL_MB = 10.0  # a disk with less room is the likeliest cause of what failed
+LOCKED_S = 10  # a git that works in the project is waited for so long
 FALLBACK = {"GIT_AUTHOR_NAME": "beadline nightly", "GIT_AUTHOR_EMAIL": "nightly@beadline.invalid"}
 
 
@@ -52,14 +54,6 @@ def names(
     return [name for name in git(command, "-z", *rest, env=env, place=place).split("\0") if name]
 
 
-def changed(*places: str, untracked: str = "no") -> list[str]:
-    """Paths below `places` (none: everywhere) that differ from the last commit; both names of one that was
-    renamed. `untracked` is git's word: no, normal or all."""
-    how = ("--porcelain", "--no-renames", f"--untracked-files={untracked}")
-    # two letters and a blank, either letter a blank too
-    return [entry[3:] for entry in names("status", *how, "--", *places)]
-
-
 def configure(settings: Mapping[str, str]) -> dict[str, str]:
     """The environment in which git goes by these settings, beside those that the environment has already."""
     before = int(os.environ.get("GIT_CONFIG_COUNT", "0") or 0)
@@ -75,28 +69,24 @@ def identity() -> dict[str, str]:
     return author | {key.replace("AUTHOR", "COMMITTER"): value for key, value in author.items()}
 
 
-def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> str:
-    """What `dvc ...` printed, run by this Python on the code of this folder. Raises ValueError with its own
-    sentence if it fails, and TooLongError if it takes longer than `limit_s`; its process group ends with
-    it."""
+def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> None:
+    """Runs `dvc ...` by this Python on the code of this folder; `log` is what it prints. Raises ValueError
+    with its own sentence if it fails, and TooLongError if it takes longer than `limit_s`; its process group
+    ends with it."""
     target = log or STATE / "dvc.log"
     target.parent.mkdir(parents=True, exist_ok=True)
-    env = os.environ | {
-        "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]),
-        "PYTHONPATH": os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")]),
-    }
-    descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-    try:
+    first = {"PATH": str(Path(sys.executable).parent), "PYTHONPATH": str(Path.cwd())}
+    paths = {key: os.pathsep.join([path, os.environ.get(key, "")]) for key, path in first.items()}
+    with target.open("wb") as printed:
         child = subprocess.Popen(
             [sys.executable, "-m", "dvc", *arguments],
-            stdout=descriptor,
+            stdout=printed,
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
             start_new_session=True,
-            env=env,
+            env=os.environ | paths,
+            preexec_fn=_end_with_the_night,
         )
-    finally:
-        os.close(descriptor)
     try:
         status = child.wait(limit_s)
     except subprocess.TimeoutExpired:
@@ -107,13 +97,18 @@ def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> str:
         if child.poll() is None:
             os.killpg(child.pid, signal.SIGKILL)
             child.wait()
-    text = target.read_text(encoding="utf-8", errors="replace")
     if status:
         # on a full disk the log is cut off, and says nothing
         free_mb = shutil.disk_usage(Path()).free / 1e6
         full = f"; no space left on device ({free_mb:.1f} MB); free some" if free_mb < FULL_MB else ""
+        text = target.read_text(encoding="utf-8", errors="replace")
         raise ValueError(f"dvc {arguments[0]} failed: {find_sentence(text)}{full}")
-    return text
+
+
+def _end_with_the_night() -> None:
+    """Asks the kernel, if it can, to end this child when the night is killed."""
+    if prctl := getattr(ctypes.CDLL(None), "prctl", None):
+        prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def find_sentence(text: str) -> str:
@@ -128,42 +123,20 @@ def find_sentence(text: str) -> str:
     return reason if own or not before else f"{before[-1]} ({reason})"
 
 
-# ---- what a killed night left
-
-
-def end_orphans() -> int:
-    """Ends what a killed night left running, for it would write beside this one; call with the lock held.
-    How many there were; 0 if the system has no /proc."""
-    ended = 0
-    for entry in Path("/proc").glob("[0-9]*"):
-        pid = int(entry.name)
-        try:
-            environment = (entry / "environ").read_bytes()
-            if pid not in (os.getpid(), os.getppid()) and f"{TOKEN}={Path.cwd()}\0".encode() in environment:
-                os.kill(pid, signal.SIGKILL)
-                ended += 1
-        except OSError:
-            continue
-    return ended
-
-
 def remove_stale_locks() -> None:
-    """Removes what a killed DVC left half written, and lock files of git if no git is at work here."""
+    """Removes what a killed DVC left half written, and the locks that git still has after LOCKED_S: a git
+    that is at work lets go of its own."""
     rwlock = Path(".dvc/tmp/rwlock")
     try:
         json.loads(rwlock.read_bytes() if rwlock.exists() else b"{}")
     except ValueError:  # half written: no later DVC would start
         rwlock.unlink(missing_ok=True)
-    if not Path("/proc/self").exists() or any(map(_works_here, Path("/proc").glob("[0-9]*"))):
-        return
     folder = Path(git("rev-parse", "--git-common-dir"))
-    for pattern in ("*.lock", "refs/heads/**/*.lock", "refs/tags/**/*.lock"):
-        for path in folder.glob(pattern):
-            path.unlink(missing_ok=True)
-
-
-def _works_here(entry: Path) -> bool:
-    try:
-        return (entry / "comm").read_text().strip() == "git" and (entry / "cwd").resolve() == Path.cwd()
-    except OSError:
-        return False
+    locks = [
+        *folder.glob("*.lock"),
+        *folder.glob("refs/heads/**/*.lock"),
+        *folder.glob("refs/tags/**/*.lock"),
+    ]
+    time.sleep(LOCKED_S if locks else 0)
+    for path in locks:
+        path.unlink(missing_ok=True)

@@ -6,18 +6,17 @@ import contextlib
 import fcntl
 import os
 import shutil
+import tempfile
 import time
 from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.nightly import inputs
 from pipeline.nightly.processes import (
+    LOCKED_S,
     STATE,
-    TOKEN,
     configure,
     dvc,
-    end_orphans,
     git,
     identity,
     names,
@@ -30,7 +29,6 @@ LOCK, COPY = STATE / "lock", STATE / "copy"
 LINKED = ("datasets/raw", "datasets/holdout")
 # a younger recording may still grow: it is copied as it is, and the next night finds it changed
 YOUNG_S = 600.0
-LOCKED_S = 10  # a git that works in the project is waited for so long
 
 
 class BusyError(ValueError):
@@ -49,26 +47,17 @@ class Snapshot(NamedTuple):
 @contextlib.contextmanager
 def locked() -> Generator[None]:
     """The night's lock; the kernel lets go if a process dies. Raises BusyError if another night has it."""
-    for folder, purpose in ((STATE, "in which nights are remembered"), (COPY, "in which a night works")):
-        if folder.exists() and not folder.is_dir():
-            raise ValueError(
-                f"{folder}: expected the folder {purpose}, found a file; move it away, and run it again"
-            )
     STATE.mkdir(exist_ok=True)
     if not (STATE / ".gitignore").exists():
         artifacts.write_text(STATE / ".gitignore", "*\n")
-    descriptor = os.open(LOCK, os.O_RDWR | os.O_CREAT)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.environ[TOKEN] = str(Path.cwd())
+    with LOCK.open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BusyError(
+                "another night is at work; this one changed nothing; run it again when that has ended"
+            ) from None
         yield
-    except BlockingIOError:
-        raise BusyError(
-            "another night is at work; this one changed nothing; run it again when that has ended"
-        ) from None
-    finally:
-        os.environ.pop(TOKEN, None)
-        os.close(descriptor)
 
 
 # ---- the copy
@@ -104,19 +93,19 @@ def take() -> Snapshot:
 
 
 def make(snapshot: Snapshot, sources: Sequence[str]) -> None:
-    """The copy with all that a night needs: the files that git has or does not have yet, `sources` among
-    them, the files and folders that it reads; recordings; memos; the outs of the stages."""
+    """The copy with all that a night needs: the files that git has or does not have yet, the files among
+    `sources` that it ignores; recordings; memos; the outs of the stages."""
     make_bare(snapshot)
-    for place in LINKED:
+    for place in map(Path, LINKED):
         if (COPY / place).is_symlink():
             (COPY / place).unlink()
         shutil.rmtree(COPY / place, ignore_errors=True)
-        if Path(place).exists():
-            link(Path(place), COPY / place, sources)
+        if place.exists():
+            shutil.copytree(place, COPY / place, copy_function=link)
     for name in (*names("ls-files", "--others", "--exclude-standard"), *sources):
         if Path(name).is_file() and not (COPY / name).exists():
             (COPY / name).parent.mkdir(parents=True, exist_ok=True)
-            link(Path(name), COPY / name)
+            link(name, COPY / name)
     memo = Path("datasets/memo")
     memo.mkdir(parents=True, exist_ok=True)
     (COPY / memo).parent.mkdir(exist_ok=True)
@@ -166,43 +155,34 @@ def _share_dvc() -> None:
     os.utime(btime, (0, 0))
 
 
-def link(source: Path, target: Path, sources: Sequence[str] = ()) -> None:
-    """The tree of `source` made of hard links: DVC adds nothing below a folder that is a link itself. On
-    another disk a file is a link. A folder that is one stays one, unless the night reads something below it,
-    `sources`: what the night moves there is then not the project's own file."""
-    if (
-        source.is_symlink()
-        and source.is_dir()
-        and not any(inputs.lies_in(name, [str(source)]) for name in sources)
-    ):
-        target.symlink_to(source.resolve())
-    elif source.is_dir():
-        target.mkdir(parents=True, exist_ok=True)
-        for entry in source.iterdir():
-            link(entry, target / entry.name, sources)
-    elif source.is_file() and 0 <= time.time() - source.stat().st_mtime < YOUNG_S:
+def link(source: str, target: str | Path) -> None:
+    """A hard link: DVC adds nothing below a folder that is a link itself. On another disk it is a link. What
+    may still grow is copied as it is, and what is no file is left out."""
+    if not Path(source).is_file():
+        return
+    if 0 <= time.time() - Path(source).stat().st_mtime < YOUNG_S:
         shutil.copy2(source, target)
-    elif source.is_file():
-        try:
-            os.link(source.resolve(), target)
-        except OSError:
-            target.symlink_to(source.resolve())
+        return
+    try:
+        os.link(Path(source).resolve(), target)
+    except OSError:
+        Path(target).symlink_to(Path(source).resolve())
 
 
 def remove() -> None:
-    """Nothing is left of the copy."""
-    if COPY.is_symlink():
-        COPY.unlink()
-    shutil.rmtree(COPY, ignore_errors=True)
+    """Nothing is left of the copy. What a killed night left running there goes on elsewhere, and harms
+    nobody."""
+    if COPY.exists():
+        elsewhere = Path(tempfile.mkdtemp(dir=STATE))
+        COPY.rename(elsewhere / "copy")
+        shutil.rmtree(elsewhere, ignore_errors=True)
     git("worktree", "prune", check=False)
 
 
 def clear_killed() -> list[str]:
-    """Ends and removes what a killed night left, as sentences."""
+    """Removes what a killed night left, and says so."""
     if not COPY.exists():
         return []
-    ended = end_orphans()
     remove_stale_locks()
     remove()
-    running = f" and had left {ended} processes running; they were ended" if ended else ""
-    return [f"the night before was killed{running}"]
+    return ["the night before was killed"]
