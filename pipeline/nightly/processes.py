@@ -1,6 +1,5 @@
 """git and dvc as they are, run as children of the night."""
 
-import ctypes
 import json
 import os
 import shlex
@@ -13,7 +12,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 STATE = Path(".beadline")
-PR_SET_PDEATHSIG = 1  # of prctl
+# DVC, which the kernel, if it can, ends when the night is killed: PR_SET_PDEATHSIG of prctl
+DVC = """
+import ctypes, runpy
+prctl = getattr(ctypes.CDLL(None), "prctl", None)
+prctl and prctl(1, 9)
+runpy.run_module("dvc", run_name="__main__", alter_sys=True)
+"""
 FULL_MB = 10.0  # a disk with less room is the likeliest cause of what failed
 LOCKED_S = 10  # a git that works in the project is waited for so long
 FALLBACK = {"GIT_AUTHOR_NAME": "beadline nightly", "GIT_AUTHOR_EMAIL": "nightly@beadline.invalid"}
@@ -77,16 +82,18 @@ def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> None
     target.parent.mkdir(parents=True, exist_ok=True)
     first = {"PATH": str(Path(sys.executable).parent), "PYTHONPATH": str(Path.cwd())}
     paths = {key: os.pathsep.join([path, os.environ.get(key, "")]) for key, path in first.items()}
-    with target.open("wb") as printed:
+    descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    try:
         child = subprocess.Popen(
-            [sys.executable, "-m", "dvc", *arguments],
-            stdout=printed,
+            [sys.executable, "-c", DVC, *arguments],
+            stdout=descriptor,
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
             start_new_session=True,
             env=os.environ | paths,
-            preexec_fn=_end_with_the_night,
         )
+    finally:
+        os.close(descriptor)
     try:
         status = child.wait(limit_s)
     except subprocess.TimeoutExpired:
@@ -103,12 +110,6 @@ def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> None
         full = f"; no space left on device ({free_mb:.1f} MB); free some" if free_mb < FULL_MB else ""
         text = target.read_text(encoding="utf-8", errors="replace")
         raise ValueError(f"dvc {arguments[0]} failed: {find_sentence(text)}{full}")
-
-
-def _end_with_the_night() -> None:
-    """Asks the kernel, if it can, to end this child when the night is killed."""
-    if prctl := getattr(ctypes.CDLL(None), "prctl", None):
-        prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def find_sentence(text: str) -> str:

@@ -50,14 +50,16 @@ def locked() -> Generator[None]:
     STATE.mkdir(exist_ok=True)
     if not (STATE / ".gitignore").exists():
         artifacts.write_text(STATE / ".gitignore", "*\n")
-    with LOCK.open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BusyError(
-                "another night is at work; this one changed nothing; run it again when that has ended"
-            ) from None
+    descriptor = os.open(LOCK, os.O_RDWR | os.O_CREAT)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
+    except BlockingIOError:
+        raise BusyError(
+            "another night is at work; this one changed nothing; run it again when that has ended"
+        ) from None
+    finally:
+        os.close(descriptor)
 
 
 # ---- the copy
