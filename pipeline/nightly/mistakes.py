@@ -109,11 +109,9 @@ def likeliest(
     as_is = baseline.misfit(drift.record(machine, segments, own.scale, ROOM), own.changes)
     tried = []
     for words, side, order, factor, offset in _list_written(inputs, outputs):
-        undone = [
-            tuple(
-                values[:, order] * factor + offset if k == side else values for k, values in enumerate(pair)
-            )
-            for pair in segments
+        undone: Segments = [
+            (u, y[:, order] * factor + offset) if side else (u[:, order] * factor + offset, y)
+            for u, y in segments
         ]
         rest = left(undone)
         scale = np.log(factor).mean() if side else 0.0

@@ -1,7 +1,6 @@
 """The temperature loop's part of a night: new recordings held against those of the champion. A record that is
 not what it says is set aside, and what it says of the machine, put right, counts all the same."""
 
-import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -307,9 +306,11 @@ def past_limit(estimates: Sequence[Sequence[float] | None], limit: float) -> flo
     """How surely a change is past its limit, in sigmas: the largest of the last nights' evidence together, of
     the last one, the last two, and so on while they agree in sign (Page's test; Page 1954). `estimates` are
     [size, standard deviation] of each night, None if it named nothing."""
-    agreeing = itertools.takewhile(
-        lambda one: one is not None and one[0] * estimates[-1][0] >= 0, reversed(estimates)
-    )
+    agreeing: list[Sequence[float]] = []
+    for estimate in reversed(estimates):
+        if estimate is None or (agreeing and estimate[0] * agreeing[0][0] < 0):
+            break
+        agreeing.append(estimate)
     evidence = np.cumsum([(abs(size) - limit) / max(deviation, 1e-9) for size, deviation in agreeing])
     return float(np.max(evidence / np.sqrt(np.arange(1, len(evidence) + 1)), initial=-np.inf))
 
