@@ -15,7 +15,12 @@ from pipeline.nightly import drift
 from pipeline.nightly.drift import Changes, DriftCause, DriftRecord, ProductionModel, Scatter, Segments
 
 OWN = 0.05  # share of its errors that a cause must explain of the champion's own records, to be taken up
-VERSION = 3
+VERSION, BEFORE = 3, 2  # of reference.json; that before it is read too
+# the changes of a machine as version 2 named them, each a list by channel
+KINDS_BEFORE = {
+    "gain": "gain", "rate": "time constant", "delay": "delay", "cap": "saturation", "offset": "offset",
+    "late": "late sensor",
+}  # fmt: skip
 
 
 class Floors(NamedTuple):
@@ -56,6 +61,17 @@ class Baseline(NamedTuple):
         changes = tuple((DriftCause(*cause), value) for cause, value in fields["changes"])
         scale = Scatter(*map(np.array, fields["scale"]))
         return cls(scale, changes, *(np.array(fields[name]) for name in cls._fields[2:]))
+
+
+def rewrite(fields: dict[str, Any]) -> dict[str, Any]:
+    """A baseline of version 2 as version 3 has it; an input without a cap had one of 1e9."""
+    changes = [
+        ((KINDS_BEFORE[name], channel), value)
+        for name, values in fields["changes"].items()
+        for channel, value in enumerate(values)
+        if value not in (0.0, 1e9)
+    ]
+    return fields | {"scale": [fields["scale"][name] for name in Scatter._fields], "changes": changes}
 
 
 def measured(

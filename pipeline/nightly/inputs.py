@@ -38,7 +38,7 @@ def sources() -> list[str]:
 def contents(places: Iterable[str], stamps: dict[str, list]) -> dict[str, str]:
     """{path: SHA-256} of all files at or below `places` that a stage would read. `stamps` remembers {path:
     [size, time of change, inode, digest]}, so that a gigabyte that did not change is not read every
-    night. Raises ValueError for a name that is no text, and for what is no file."""
+    night. Raises ValueError for a name that is no text, for what is no file, and for what cannot be read."""
     found = [path for place in places for path in (Path(place), *sorted(Path(place).rglob("*")))]
     files = [path for path in found if path.is_symlink() or (path.exists() and not path.is_dir())]
     digests = {}
@@ -50,7 +50,12 @@ def contents(places: Iterable[str], stamps: dict[str, list]) -> dict[str, str]:
         path, status = file.as_posix(), file.stat()
         stamp = [status.st_size, status.st_mtime_ns, status.st_ino]
         if stamps.get(path, [])[:3] != stamp:
-            stamps[path] = [*stamp, artifacts.sha256(file)]
+            try:
+                stamps[path] = [*stamp, artifacts.sha256(file)]
+            except OSError as error:
+                raise ValueError(
+                    f"{path} cannot be read ({error.strerror}); make it readable, or move it away"
+                ) from None
         digests[path] = stamps[path][3]
     return digests
 

@@ -7,20 +7,23 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Mapping
 from pathlib import Path
 
 STATE = Path(".beadline")
-# DVC, which the kernel, if it can, ends when the night is killed: PR_SET_PDEATHSIG of prctl
+# DVC for the night whose number its first argument is. If the night is killed, the kernel says so, if it can
+# (PR_SET_PDEATHSIG of prctl), and DVC ends with its stages, which are of its process group. The stages do not
+# hear of it themselves
 DVC = """
-import ctypes, runpy
+import ctypes, os, runpy, signal, sys
+signal.signal(signal.SIGTERM, lambda *_: os.killpg(0, signal.SIGKILL))
 prctl = getattr(ctypes.CDLL(None), "prctl", None)
-prctl and prctl(1, 9)
+prctl and prctl(1, signal.SIGTERM)
+if os.getppid() != int(sys.argv.pop(1)):
+    sys.exit("the night was killed before the kernel was asked")
 runpy.run_module("dvc", run_name="__main__", alter_sys=True)
 """
 FULL_MB = 10.0  # a disk with less room is the likeliest cause of what failed
-LOCKED_S = 10  # a git that works in the project is waited for so long
 FALLBACK = {"GIT_AUTHOR_NAME": "beadline nightly", "GIT_AUTHOR_EMAIL": "nightly@beadline.invalid"}
 
 
@@ -85,7 +88,7 @@ def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> None
     descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     try:
         child = subprocess.Popen(
-            [sys.executable, "-c", DVC, *arguments],
+            [sys.executable, "-c", DVC, str(os.getpid()), *arguments],
             stdout=descriptor,
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
@@ -125,8 +128,8 @@ def find_sentence(text: str) -> str:
 
 
 def remove_stale_locks() -> None:
-    """Removes what a killed DVC left half written, and the locks that git still has after LOCKED_S: a git
-    that is at work lets go of its own."""
+    """Removes what a killed DVC left half written, and lock files of git if no git is at work here: an editor
+    may be open for hours over `git commit -a`, which holds its lock."""
     rwlock = Path(".dvc/tmp/rwlock")
     try:
         json.loads(rwlock.read_bytes() if rwlock.exists() else b"{}")
@@ -138,6 +141,22 @@ def remove_stale_locks() -> None:
         *folder.glob("refs/heads/**/*.lock"),
         *folder.glob("refs/tags/**/*.lock"),
     ]
-    time.sleep(LOCKED_S if locks else 0)
-    for path in locks:
-        path.unlink(missing_ok=True)
+    if locks and not _git_works():
+        for path in locks:
+            path.unlink(missing_ok=True)
+
+
+def _git_works() -> bool:
+    """Whether a git is at work in the project; True if the system cannot tell."""
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            if (entry / "comm").read_text().strip() != "git":
+                continue
+            folder = Path(os.readlink(entry / "cwd"))
+        except PermissionError:  # it is another user's
+            return True
+        except OSError:  # it has ended
+            continue
+        if Path.cwd() in (folder, *folder.parents):
+            return True
+    return not Path("/proc/self").exists()

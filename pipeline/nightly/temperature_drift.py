@@ -112,7 +112,8 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
     floors = NIGHTS_FLOORS
     if len(kept) == 1:
         parts = {name: np.array_split(column[-LONGEST:], PIECES) for name, column in kept[0].items()}
-        kept = [{name: columns[k] for name, columns in parts.items()} for k in range(PIECES)]
+        pieces = [{name: columns[k] for name, columns in parts.items()} for k in range(PIECES)]
+        kept = [one for one in pieces if judge.segments(one, machine)]
         floors = PIECES_FLOORS
     nights = [_last(judge.segments(one, machine)) for one in kept]
     samples = int(np.median([sum(len(u) for u, _ in night) for night in nights])) if nights else 0
@@ -155,13 +156,15 @@ def read_reference(folder: Path, machine: Plant, limits: DriftLimits) -> Product
     """That of a champion's folder; None if it has none that this version reads."""
     path = folder / REFERENCE
     fields = artifacts.read_json(path) if path.exists() else {}
-    if fields.get("version") != baseline.VERSION:
+    if fields.get("version") not in (baseline.BEFORE, baseline.VERSION):
         return None
+    own = fields["own"] if fields["version"] == baseline.VERSION else baseline.rewrite(fields["own"])
+    model = ProductionModel(judge.identified(folder), fields["samples"])
     return ProductionReference(
-        ProductionModel(judge.identified(folder), fields["samples"]),
-        Baseline.read(fields["own"]),
+        model,
+        Baseline.read(own),
         fields["loop"],
-        np.array(fields["steps"]),
+        np.array(fields.get("steps", [np.inf] * model.plant.p)),
         artifacts.sha256(path),
         machine,
         limits,

@@ -39,13 +39,19 @@ class Routes(NamedTuple):
 
 def find_routes(settings: Nightly | None) -> Routes:
     """Those of the environment, so that no secret stands in a file; otherwise those of the parameters, or if
-    these are broken, of the last commit."""
-    written = settings.model_dump() if settings else {}
-    with contextlib.suppress(yaml.YAMLError, KeyError, TypeError):
-        written = written or yaml.safe_load(git("show", f"HEAD:{params.FILE}", check=False))["nightly"]
+    these are broken, of the last commit whose parameters can be read."""
+    written = settings.model_dump() if settings else _read_committed()
     return Routes(
         *(os.environ.get(f"BEADLINE_{key.upper()}") or str(written.get(key, "")) for key in Routes._fields)
     )
+
+
+def _read_committed() -> dict[str, Any]:
+    revisions = git("rev-list", "-n", "20", "HEAD", "--", params.FILE, check=False).split()
+    for revision in ("HEAD", *revisions):
+        with contextlib.suppress(yaml.YAMLError, KeyError, TypeError, ValueError):
+            return dict(yaml.safe_load(git("show", f"{revision}:{params.FILE}", check=False))["nightly"])
+    return {}
 
 
 def hide_secrets(settings: Nightly) -> Nightly:

@@ -6,29 +6,21 @@ import contextlib
 import fcntl
 import os
 import shutil
-import tempfile
 import time
 from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.nightly.processes import (
-    LOCKED_S,
-    STATE,
-    configure,
-    dvc,
-    git,
-    identity,
-    names,
-    remove_stale_locks,
-)
+from pipeline.nightly import inputs
+from pipeline.nightly.processes import STATE, configure, dvc, git, identity, names, remove_stale_locks
 from pipeline.nightly.reproducing import read_stages
 from pipeline.store import artifacts
 
-LOCK, COPY = STATE / "lock", STATE / "copy"
+LOCK, COPY, OLD = STATE / "lock", STATE / "copy", STATE / "copy.old"
 LINKED = ("datasets/raw", "datasets/holdout")
 # a younger recording may still grow: it is copied as it is, and the next night finds it changed
 YOUNG_S = 600.0
+LOCKED_S = 10  # a git that works in the project is waited for so long
 
 
 class BusyError(ValueError):
@@ -47,6 +39,11 @@ class Snapshot(NamedTuple):
 @contextlib.contextmanager
 def locked() -> Generator[None]:
     """The night's lock; the kernel lets go if a process dies. Raises BusyError if another night has it."""
+    for folder, purpose in ((STATE, "in which nights are remembered"), (COPY, "in which a night works")):
+        if folder.exists() and not folder.is_dir():
+            raise ValueError(
+                f"{folder}: expected the folder {purpose}, found a file; move it away, and run it again"
+            )
     STATE.mkdir(exist_ok=True)
     if not (STATE / ".gitignore").exists():
         artifacts.write_text(STATE / ".gitignore", "*\n")
@@ -103,11 +100,11 @@ def make(snapshot: Snapshot, sources: Sequence[str]) -> None:
             (COPY / place).unlink()
         shutil.rmtree(COPY / place, ignore_errors=True)
         if place.exists():
-            shutil.copytree(place, COPY / place, copy_function=link)
+            link(place, COPY / place, sources)
     for name in (*names("ls-files", "--others", "--exclude-standard"), *sources):
         if Path(name).is_file() and not (COPY / name).exists():
             (COPY / name).parent.mkdir(parents=True, exist_ok=True)
-            link(name, COPY / name)
+            link(Path(name), COPY / name)
     memo = Path("datasets/memo")
     memo.mkdir(parents=True, exist_ok=True)
     (COPY / memo).parent.mkdir(exist_ok=True)
@@ -157,27 +154,36 @@ def _share_dvc() -> None:
     os.utime(btime, (0, 0))
 
 
-def link(source: str, target: str | Path) -> None:
-    """A hard link: DVC adds nothing below a folder that is a link itself. On another disk it is a link. What
-    may still grow is copied as it is, and what is no file is left out."""
-    if not Path(source).is_file():
-        return
-    if 0 <= time.time() - Path(source).stat().st_mtime < YOUNG_S:
+def link(source: Path, target: Path, sources: Sequence[str] = ()) -> None:
+    """The tree of `source` made of hard links: DVC adds nothing below a folder that is a link itself. On
+    another disk a file is a link. What may still grow is copied as it is, and what is no file is left out. A
+    folder that is a link stays one, unless the night reads something below it, `sources`: what the night
+    moves there is then not the project's own file."""
+    is_read = any(inputs.lies_in(name, [str(source)]) for name in sources)
+    if source.is_dir() and source.is_symlink() and not is_read:
+        target.symlink_to(source.resolve())
+    elif source.is_dir():
+        target.mkdir(parents=True, exist_ok=True)
+        for entry in source.iterdir():
+            link(entry, target / entry.name, sources)
+    elif source.is_file() and 0 <= time.time() - source.stat().st_mtime < YOUNG_S:
         shutil.copy2(source, target)
-        return
-    try:
-        os.link(Path(source).resolve(), target)
-    except OSError:
-        Path(target).symlink_to(Path(source).resolve())
+    elif source.is_file():
+        try:
+            os.link(source.resolve(), target)
+        except OSError:
+            target.symlink_to(source.resolve())
 
 
 def remove() -> None:
-    """Nothing is left of the copy. What a killed night left running there goes on elsewhere, and harms
-    nobody."""
-    if COPY.exists():
-        elsewhere = Path(tempfile.mkdtemp(dir=STATE))
-        COPY.rename(elsewhere / "copy")
-        shutil.rmtree(elsewhere, ignore_errors=True)
+    """Nothing is left of the copy. It is renamed first: a stage of a killed night that writes until it ends,
+    a moment later, does not write into the next copy."""
+    shutil.rmtree(OLD, ignore_errors=True)
+    if COPY.is_symlink():
+        COPY.unlink()
+    elif COPY.exists():
+        COPY.rename(OLD)
+        shutil.rmtree(OLD, ignore_errors=True)
     git("worktree", "prune", check=False)
 
 

@@ -128,8 +128,8 @@ def test_a_night_that_cannot_even_begin_wakes_the_command_by_its_input(tmp_path,
     command = f"{sys.executable} -c \"import sys; open('heard','w').write(sys.stdin.read())\""
     monkeypatch.setenv("BEADLINE_ALARM", command)
     status, summary = night.nightly(render_night)
-    assert status == reporting.FAILED and ".beadline" in summary
-    assert ".beadline" in json.loads(Path("heard").read_text())["text"]
+    assert status == reporting.FAILED and ".beadline: expected the folder" in summary
+    assert ".beadline: expected the folder" in json.loads(Path("heard").read_text())["text"]
 
 
 # ---- who is told

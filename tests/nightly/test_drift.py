@@ -199,6 +199,25 @@ def test_a_baseline_comes_back_from_its_file(own):
     np.testing.assert_array_equal(own.values, again.values)
 
 
+def test_a_baseline_of_version_2_is_read_as_one_of_version_3(own):
+    none = [0.0, 0.0]
+    by_name = {
+        "gain": [0.01, 0.0],
+        "rate": none,
+        "delay": none,
+        "cap": [1e9, 62.0],
+        "offset": none,
+        "late": none,
+    }
+    scale = {name: np.asarray(value).tolist() for name, value in own.scale._asdict().items()}
+    before = own.to_json() | {"changes": dict(sorted(by_name.items())), "scale": dict(sorted(scale.items()))}
+    again = Baseline.read(baseline.rewrite(before))
+    expected = {(drift.DriftCause("gain", 0), 0.01), (drift.DriftCause("saturation", 1), 62.0)}
+    assert {*again.changes} == expected
+    for now, then in zip(again.scale, own.scale, strict=True):
+        np.testing.assert_array_equal(now, then)
+
+
 def test_every_rate_scaled_back_is_the_plant_again():
     there = drift.faster(drift.faster(MODEL, 0.25), -0.2)
     np.testing.assert_allclose(there.A, MODEL.A, atol=1e-10)  # expm and logm to rounding

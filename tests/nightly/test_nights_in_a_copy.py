@@ -5,13 +5,14 @@ import fcntl
 import json
 import os
 import subprocess
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline.cli import render_night
-from pipeline.nightly import by_hand, champion, night, remembered, reporting, worktree
+from pipeline.nightly import by_hand, champion, night, processes, remembered, reporting, worktree
 from pipeline.store import artifacts
 from tests.nightly.toy_nights import DVC, SETTINGS, Project, entered
 
@@ -401,6 +402,58 @@ def test_killed_at_random_moments_all_is_as_before_or_as_after(project):
         assert project.run("git", "show", "HEAD:dvc.lock").stdout.encode() == lock
         assert project.run("dvc", "status", "-q").returncode == 0
     subprocess.run(["git", "fsck", "--strict"], check=True, capture_output=True)
+
+
+def test_the_stages_of_a_night_that_is_killed_end_with_it(project):
+    Path("slow.txt").write_text("3600")
+    project.record("better", [9.0])
+    child = project.start()
+
+    def find_running() -> list[str]:
+        """Command lines of the processes that work in the copy."""
+        found = []
+        for entry in Path("/proc").glob("[0-9]*"):
+            try:
+                if Path(os.readlink(entry / "cwd")).is_relative_to(worktree.COPY.resolve()):
+                    found.append((entry / "cmdline").read_text())
+            except OSError:
+                continue
+        return found
+
+    def wait_for(stages: bool) -> None:
+        for _ in range(600):
+            if any("learn.py" in words for words in find_running()) == stages:
+                return
+            time.sleep(0.1)
+
+    wait_for(stages=True)
+    assert find_running()
+    child.kill()  # the night alone: what DVC runs has a session of its own
+    child.communicate()
+    wait_for(stages=False)
+    assert find_running() == []
+    Path("slow.txt").write_text("0")
+    assert "the night before was killed" in run() and not worktree.OLD.exists()
+
+
+def test_the_lock_of_a_git_that_works_stays_and_that_of_one_that_was_killed_goes(project):
+    lock = Path(".git/index.lock")
+    Path("learn.py").write_text(Path("learn.py").read_text() + "# other code\n")
+    editing = subprocess.Popen(
+        ["git", "commit", "-aq"],
+        env=os.environ | {"GIT_EDITOR": "sleep 60 #"},
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    while not lock.exists():
+        time.sleep(0.05)
+    processes.remove_stale_locks()
+    assert lock.exists()
+    os.killpg(editing.pid, 9)
+    editing.wait()
+    assert lock.exists()
+    processes.remove_stale_locks()
+    assert not lock.exists()
 
 
 @pytest.mark.parametrize(

@@ -162,6 +162,35 @@ def test_production_that_somebody_changed_or_deleted_comes_back(project):
     assert champion.md5s(Path("champion/toy")) == champion.read().champions["toy"].files
 
 
+def test_a_file_in_the_place_of_the_copy_is_named_and_what_a_link_there_leads_to_stays(project, tmp_path):
+    project.record("better", [9.0, 9.0, 9.0])
+    before = observe(project)
+    worktree.COPY.write_text("mine")
+    status, summary = night.nightly(render_night)
+    assert status == reporting.FAILED
+    assert ".beadline/copy: expected the folder in which a night works, found a file" in summary
+    with pytest.raises(ValueError, match="found a file; move it away"):
+        by_hand.rollback("", "")
+    assert observe(project) == before and worktree.COPY.read_text() == "mine"
+    worktree.COPY.unlink()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/file").write_text("mine")
+    worktree.COPY.symlink_to(tmp_path / "mine")
+    assert "promoted toy" in run()
+    assert (tmp_path / "mine/file").read_text() == "mine"
+
+
+def test_a_link_to_a_folder_below_the_recordings_is_as_it_is_by_hand(project, tmp_path):
+    """No stage reads behind it, nor does the night; so that nothing is new because of it."""
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/more.csv").write_text("50.0")
+    Path("datasets/raw/toy/mine").symlink_to(tmp_path / "mine")
+    Path("datasets/raw/toy/again").symlink_to(".")
+    project.record("better", [9.0, 9.0, 9.0])
+    assert "promoted toy" in run() and learned() == 10.0
+    assert "nothing new" in run() and (tmp_path / "mine/more.csv").read_text() == "50.0"
+
+
 @pytest.mark.parametrize("promotion", ["at_once", "branch"])
 def test_on_a_detached_head_nothing_is_lost(project, promotion):
     project.set(promotion=promotion)
