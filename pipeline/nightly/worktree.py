@@ -181,9 +181,10 @@ def remove() -> None:
     shutil.rmtree(OLD, ignore_errors=True)
     if COPY.is_symlink():
         COPY.unlink()
-    elif COPY.exists():
+    with contextlib.suppress(OSError):  # there is none, or no room: then it goes where it is
         COPY.rename(OLD)
-        shutil.rmtree(OLD, ignore_errors=True)
+    for place in (OLD, COPY):
+        shutil.rmtree(place, ignore_errors=True)
     git("worktree", "prune", check=False)
 
 

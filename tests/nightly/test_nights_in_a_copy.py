@@ -315,6 +315,7 @@ def test_what_the_night_is_made_from_changes_meanwhile_and_nothing_is_changed(pr
         during_the_stages(context, acts[act][0])
         assert acts[act][1] in run(reporting.FAILED)
     assert project.production() == before and learned() == 11.0
+    assert recording.read_text().endswith("50.0\n") == (act == "records")
     assert (
         not project.run("git", "tag", "--contains", main)
         .stdout.replace("production/toy/night-0001", "")
