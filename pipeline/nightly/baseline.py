@@ -54,11 +54,12 @@ class Baseline(NamedTuple):
     def to_json(self) -> dict[str, Any]:
         """As reference.json has it."""
         arrays = {name: np.asarray(getattr(self, name)).tolist() for name in self._fields[2:]}
-        return {"scale": [np.asarray(one).tolist() for one in self.scale], "changes": self.changes, **arrays}
+        changes = [[*cause, value] for cause, value in self.changes]
+        return {"scale": [np.asarray(one).tolist() for one in self.scale], "changes": changes, **arrays}
 
     @classmethod
     def read(cls, fields: dict[str, Any]) -> "Baseline":
-        changes = tuple((DriftCause(*cause), value) for cause, value in fields["changes"])
+        changes = tuple((DriftCause(kind, channel), value) for kind, channel, value in fields["changes"])
         scale = Scatter(*map(np.array, fields["scale"]))
         return cls(scale, changes, *(np.array(fields[name]) for name in cls._fields[2:]))
 
@@ -66,7 +67,7 @@ class Baseline(NamedTuple):
 def rewrite(fields: dict[str, Any]) -> dict[str, Any]:
     """A baseline of version 2 as version 3 has it; an input without a cap had one of 1e9."""
     changes = [
-        ((KINDS_BEFORE[name], channel), value)
+        (KINDS_BEFORE[name], channel, value)
         for name, values in fields["changes"].items()
         for channel, value in enumerate(values)
         if value not in (0.0, 1e9)
