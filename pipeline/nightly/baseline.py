@@ -12,10 +12,15 @@ import numpy as np
 import scipy.stats
 
 from pipeline.nightly import drift
-from pipeline.nightly.drift import DriftCause, DriftRecord, MachineChanges, ProductionModel, Scatter, Segments
+from pipeline.nightly.drift import Changes, DriftCause, DriftRecord, ProductionModel, Scatter, Segments
 
 OWN = 0.05  # share of its errors that a cause must explain of the champion's own records, to be taken up
-VERSION = 2
+VERSION, BEFORE = 3, 2  # of reference.json; that before it is read too
+# the changes of a machine as version 2 named them, each a list by channel
+KINDS_BEFORE = {
+    "gain": "gain", "rate": "time constant", "delay": "delay", "cap": "saturation", "offset": "offset",
+    "late": "late sensor",
+}  # fmt: skip
 
 
 class Floors(NamedTuple):
@@ -34,7 +39,7 @@ class Baseline(NamedTuple):
     (nights,)."""
 
     scale: Scatter
-    changes: MachineChanges
+    changes: Changes
     values: np.ndarray
     deviations: np.ndarray
     explained: np.ndarray
@@ -48,25 +53,26 @@ class Baseline(NamedTuple):
 
     def to_json(self) -> dict[str, Any]:
         """As reference.json has it."""
-        cap = np.where(np.isfinite(self.changes.cap), self.changes.cap, 1e9)
-        return {
-            "scale": _lists(self.scale),
-            "changes": _lists(self.changes._replace(cap=cap)),
-            **{name: np.asarray(getattr(self, name)).tolist() for name in self._fields[2:]},
-        }
+        arrays = {name: np.asarray(getattr(self, name)).tolist() for name in self._fields[2:]}
+        changes = [[*cause, value] for cause, value in self.changes]
+        return {"scale": [np.asarray(one).tolist() for one in self.scale], "changes": changes, **arrays}
 
     @classmethod
     def read(cls, fields: dict[str, Any]) -> "Baseline":
-        known = fields["scale"]
-        variance, level, mean_level = (np.array(known[name]) for name in ("variance", "level", "mean_level"))
-        scale = Scatter(variance, float(known["ambient"]), level, mean_level)
-        changes = MachineChanges(**{name: np.array(value) for name, value in fields["changes"].items()})
-        changes = changes._replace(cap=np.where(changes.cap < 1e8, changes.cap, np.inf))
+        changes = tuple((DriftCause(kind, channel), value) for kind, channel, value in fields["changes"])
+        scale = Scatter(*map(np.array, fields["scale"]))
         return cls(scale, changes, *(np.array(fields[name]) for name in cls._fields[2:]))
 
 
-def _lists(fields: Scatter | MachineChanges) -> dict[str, Any]:
-    return {name: np.asarray(value).tolist() for name, value in fields._asdict().items()}
+def rewrite(fields: dict[str, Any]) -> dict[str, Any]:
+    """A baseline of version 2 as version 3 has it; an input without a cap had one of 1e9."""
+    changes = [
+        (KINDS_BEFORE[name], channel, value)
+        for name, values in fields["changes"].items()
+        for channel, value in enumerate(values)
+        if value not in (0.0, 1e9)
+    ]
+    return fields | {"scale": [fields["scale"][name] for name in Scatter._fields], "changes": changes}
 
 
 def measured(
@@ -77,42 +83,33 @@ def measured(
 ) -> Baseline:
     """The baseline of a champion's nights, each held against the model of `without` that was identified
     without it (None: the champion's own). Raises ValueError where they are too short."""
-    plant, together = machine.plant, [pair for night in nights for pair in night]
-    loose, none = _loose(machine, together), MachineChanges.none(plant.m, plant.p)
+    together = [pair for night in nights for pair in night]
+    loose = _loose(machine, together)
     record = drift.record(machine, together, loose)
-    errors = drift.left(record, none)
-    causes = drift.causes(plant)
-    changes = drift.explain(record, none, dict.fromkeys(causes, OWN / 2 * float(errors @ errors))).changes
+    errors = drift.left(record, ())
+    usual = dict.fromkeys(drift.causes(machine.plant), OWN / 2 * float(errors @ errors))
+    changes = drift.explain(record, (), usual).changes
     models = without or [machine] * len(nights)
     scale = _scale(models, nights, loose, changes, floors)
     records = [rested(model, night, scale, changes) for model, night in zip(models, nights, strict=True)]
     # a new night is held against the champion's own model: what that one gets wrong of its own nights, and
     # those without them do not, is no change of the machine either
     held = [*records, *(rested(machine, night, scale, changes) for night in (nights if without else []))]
-    fits = [drift.alone(one, changes) for one in held]
-    rest = [drift.left(one, changes) for one in records]
-    noises = [noise(drift.by_output(one, e)) for one, e in zip(records, rest, strict=True)]
+    estimates = np.array([[fit[1:] for fit in drift.alone(one, changes)] for one in held])
+    noises = [noise(drift.by_output(one, drift.left(one, changes))) for one in records]
+    misfits = np.array([misfit(one, changes) for one in records])
     return Baseline(
-        scale,
-        changes,
-        np.array([[fit.value for fit in night] for night in fits]),
-        np.array([[fit.deviation for fit in night] for night in fits]),
-        np.array([[fit.explained for fit in night] for night in fits]),
-        np.array([value for value, _ in noises]),
-        np.array([deviation for _, deviation in noises]),
-        np.array([misfit(one, changes) for one in records]),
+        scale, changes, *np.moveaxis(estimates, 2, 0), *map(np.array, zip(*noises, strict=True)), misfits
     )
 
 
-def rested(
-    machine: ProductionModel, segments: Segments, scale: Scatter, changes: MachineChanges
-) -> DriftRecord:
+def rested(machine: ProductionModel, segments: Segments, scale: Scatter, changes: Changes) -> DriftRecord:
     """A record in the surroundings that it was made in."""
     there, room = drift.room_of(machine, segments, scale, changes)
     return drift.record(machine, segments, there, room._replace(another_season=False))
 
 
-def misfit(record: DriftRecord, changes: MachineChanges) -> float:
+def misfit(record: DriftRecord, changes: Changes) -> float:
     """Weighted squared error a sample: near 1 on a record like the champion's own."""
     e = drift.left(record, changes)
     return float(e @ e) / max(sum(int(one.measured.sum()) for one in record.segments), 1)
@@ -135,7 +132,7 @@ def _loose(machine: ProductionModel, together: Segments) -> Scatter:
     scale = Scatter(np.ones(plant.p), 30.0, np.full(plant.p, 5.0), np.zeros(plant.p))
     for _ in range(2):
         record = drift.record(machine, together, scale)
-        errors = drift.by_output(record, drift.left(record, MachineChanges.none(plant.m, plant.p)))
+        errors = drift.by_output(record, drift.left(record, ()))
         scale = scale._replace(variance=np.maximum(np.nanmean(errors**2, axis=0), 1e-8))
     return scale
 
@@ -144,7 +141,7 @@ def _scale(
     models: Sequence[ProductionModel],
     nights: Sequence[Segments],
     loose: Scatter,
-    changes: MachineChanges,
+    changes: Changes,
     floors: Floors,
 ) -> Scatter:
     """How honest nights scatter, from these. Of a few nights a standard deviation is small by chance:

@@ -6,10 +6,10 @@ from collections.abc import Callable, Generator
 
 from pipeline.nightly import champion, landing, remembered, screening, watch, worktree
 from pipeline.nightly.landing import Landing
-from pipeline.nightly.records import DRIFT_ACCEPTED, ROLLED_BACK, ChampionState
+from pipeline.nightly.records import DRIFT_ACCEPTED, ROLLED_BACK, ChampionState, to_json
 from pipeline.nightly.settings import Nightly
 from pipeline.nightly.worktree import COPY, Snapshot
-from pipeline.store import params
+from pipeline.store import artifacts, params
 
 
 def rollback(run: str, loop: str, *, dry_run: bool = False) -> str:
@@ -59,7 +59,7 @@ def accept(loop: str, why: str) -> str:
 
         def change(state: ChampionState) -> ChampionState:
             champion.bring(loop, state.champions[loop])
-            folder, files = champion.hand_over(loop, {screening.REFERENCE: reference})
+            folder, files = champion.hand_over(loop, [], {screening.REFERENCE: reference})
             present = state.champions[loop]._replace(folder=folder, files=files)
             return champion.promote(state, loop, present, event=DRIFT_ACCEPTED, when=when, why=why)
 
@@ -89,7 +89,7 @@ def _change(state: ChampionState, change: Callable[[ChampionState], ChampionStat
     worktree.make_bare(Snapshot(snapshot.head, snapshot.head))
     with contextlib.chdir(COPY):
         state = change(state)
-        champion.write(state)
+        artifacts.write_json(champion.FILE, to_json(state))
         paths = champion.paths(state)
     made = landing.commit(paths, message, [snapshot.head])
     landing.land(Landing(made, landing.get_branch(), snapshot.head, snapshot.files, {}), message)

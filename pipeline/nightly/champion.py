@@ -22,7 +22,6 @@ from pipeline.nightly.records import (
     ChampionState,
     HistoryLine,
     from_json,
-    to_json,
 )
 from pipeline.nightly.worktree import COPY, Snapshot
 from pipeline.store import artifacts
@@ -36,7 +35,8 @@ def read(commit: str = "HEAD") -> ChampionState:
     broken."""
     text = git("show", f"{commit}:{FILE}", check=False)
     try:
-        return from_json(ChampionState, json.loads(text or "{}"))
+        fields = json.loads(text or "{}", object_hook=_drop_metrics)
+        return from_json(ChampionState, fields)
     except (ValueError, TypeError) as error:
         raise ValueError(
             f"{FILE} of the last commit: {error}; take the file of a good commit (git log {FILE}), "
@@ -44,8 +44,9 @@ def read(commit: str = "HEAD") -> ChampionState:
         ) from None
 
 
-def write(state: ChampionState) -> None:
-    artifacts.write_json(FILE, to_json(state))
+def _drop_metrics(fields: dict[str, Any]) -> dict[str, Any]:
+    """Without the figures that champion.json had before."""
+    return {key: value for key, value in fields.items() if key != "metrics"}
 
 
 def md5s(folder: Path) -> dict[str, str]:
@@ -71,31 +72,26 @@ def missing(files: Sequence[str]) -> list[str]:
 # ---- in the copy
 
 
-def install(
+def hand_over(
     folder: str, files: Sequence[str], beside: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Copies the files into champion/<folder>, with what is to lie beside them as JSON by name, and hands the
-    folder to DVC; what its pointer says, and MD5 by path."""
-    shutil.rmtree(FOLDER / folder, ignore_errors=True)
+    """Copies the files into champion/<folder>, writes what is to lie beside them as JSON by name, and gives
+    the folder to DVC: what its pointer says, and MD5 by path."""
+    place = FOLDER / folder
     for name in files:
-        target = FOLDER / folder / name.removeprefix("datasets/")
+        target = place / name.removeprefix("datasets/")
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(name, target)
-    return hand_over(folder, beside)
-
-
-def hand_over(folder: str, beside: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Gives champion/<folder> to DVC, with what is to lie beside its files as JSON by name."""
     for name, content in beside.items():
-        (FOLDER / folder / name).unlink(missing_ok=True)  # it may be a link into DVC's cache
-        artifacts.write_json(FOLDER / folder / name, content)
-    dvc("add", "--quiet", str(FOLDER / folder))
+        (place / name).unlink(missing_ok=True)  # it may be a link into DVC's cache
+        artifacts.write_json(place / name, content)
+    dvc("add", "--quiet", str(place))
     pointer = yaml.safe_load((FOLDER / f"{folder}.dvc").read_text(encoding="utf-8"))["outs"][0]
-    files = md5s(FOLDER / folder)
+    hashes = md5s(place)
     # what `bring` takes them from is on the disk before a commit names it
-    for md5 in {pointer["md5"], *files.values()}:
+    for md5 in {pointer["md5"], *hashes.values()}:
         _write_through(Path(".dvc/cache/files/md5", md5[:2], md5[2:]))
-    return pointer, files
+    return pointer, hashes
 
 
 def remove(folder: str) -> None:
@@ -163,14 +159,11 @@ def follow() -> list[str]:
 
 def exchange(new: Path, target: Path) -> None:
     """`new` and `target` trade places: by one rename if the system can, else by two."""
-    if not target.exists():
-        new.rename(target)
-        return
     rename = getattr(ctypes.CDLL(None), "renameat2", None)
-    if rename and rename(HERE, os.fsencode(new), HERE, os.fsencode(target), EXCHANGE) == 0:
+    if target.exists() and rename and not rename(HERE, os.fsencode(new), HERE, os.fsencode(target), EXCHANGE):
         return
-    old = new.with_name(f"{new.name}.old")
-    target.rename(old)
+    if target.exists():
+        target.rename(new.with_name(f"{new.name}.old"))
     new.rename(target)
 
 
@@ -193,9 +186,10 @@ def promote(
     there, which are the champion's own if they are empty."""
     before = state.champions.get(loop)
     replaced = before.files if before and event == ROLLED_BACK else {}
-    when, why = when or champion.when, why or champion.why
-    run = before.run if before else None
-    line = HistoryLine(champion.run, loop, event, when, why, run, champion, replaced)
+    line = HistoryLine(
+        champion.run, loop, event, when or champion.when, why or champion.why,
+        before.run if before else None, champion, replaced,
+    )  # fmt: skip
     return state._replace(champions={**state.champions, loop: champion}, history=(*state.history, line))
 
 
@@ -216,13 +210,12 @@ def stack(state: ChampionState, loop: str) -> list[tuple[int, Champion]]:
     back."""
     champions: list[tuple[int, Champion]] = []
     for number, line in enumerate(state.history):
+        at = [k for k, (_, one) in enumerate(champions) if one.md5 == line.champion.md5]
         if line.loop != loop:
             continue
-        if line.event == ROLLED_BACK:
-            # down to the one that was put back; if that had gone itself, it comes on top
-            at = [k for k, (_, champion) in enumerate(champions) if champion.md5 == line.champion.md5]
-            champions = champions[: at[-1] + 1] if at else [*champions, (number, line.champion)]
-        elif line.event == DRIFT_ACCEPTED and champions:
+        if line.event == ROLLED_BACK and at:
+            champions = champions[: at[-1] + 1]  # down to the one that was put back
+        elif line.event == DRIFT_ACCEPTED:
             champions[-1] = (champions[-1][0], line.champion)
         else:
             champions.append((number, line.champion))
@@ -238,15 +231,15 @@ def find_earlier(state: ChampionState, run: str, loop: str) -> dict[str, Champio
         raise ValueError(
             f"{FILE}: expected a loop with a champion, found {loop}; loops with a champion are: {loops}"
         )
-    history = [line for line in state.history if not loop or line.loop == loop]
     if run:
-        champions = {line.loop: line.champion for line in history if line.run == run}
+        lines = [line for line in state.history if line.run == run and loop in ("", line.loop)]
+        champions = {line.loop: line.champion for line in lines}
         if champions and all(state.champions[name].md5 == former.md5 for name, former in champions.items()):
             raise ValueError(f"{FILE}: {run} is in production already; nothing is to be put back")
     else:
         stacks = {name: stack(state, name) for name in ([loop] if loop else state.champions)}
-        latest = max(((one[-1][0], name) for name, one in stacks.items() if len(one) > 1), default=None)
-        champions = {latest[1]: stacks[latest[1]][-2][1]} if latest else {}
+        latest = max(((one[-1][0], name) for name, one in stacks.items() if len(one) > 1), default=(0, ""))[1]
+        champions = {latest: stacks[latest][-2][1]} if latest else {}
     if champions:
         return champions
     runs = ", ".join(dict.fromkeys(f"{line.run} ({line.loop})" for line in state.history)) or "none"

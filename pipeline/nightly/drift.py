@@ -17,11 +17,13 @@ A level thus counts in °C of the steady output whatever the observer, and a gai
 its level together.
 """
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 import scipy.stats
 
 from pipeline.temperature.identification.refinement import Predictor, free_response, linear_recurrence
@@ -36,6 +38,8 @@ RANGES = {
     "gain": (0.02, -0.98, 1.0), "time constant": (0.02, -0.6, 1.5), "offset": (0.1, -60.0, 60.0),
     "delay": (1.0, -16.0, 64.0), "late sensor": (1.0, -16.0, 64.0),
 }  # fmt: skip
+GUESSES = dict.fromkeys(("delay", "late sensor"), (6.0, 20.0, 40.0))  # where the search may begin, beside 0
+ENOUGH = 0.01  # of the squared error: steps that win less are not taken
 SURE = 5.0  # a cause is named from so many sigmas on, squared: what it explains beyond the noise
 # of what the first cause explains, a second one must explain so much: less is what the model gets wrong of it
 REMAINDER = 0.004
@@ -60,31 +64,14 @@ class DriftCause(NamedTuple):
     channel: int
 
 
-class MachineChanges(NamedTuple):
-    """Of a machine against the model: share of each gain (m,), of each rate (m,), delay in samples (m,), the
-    most that acts of each input (m,), then offset in °C (p,) and lateness in samples (p,) of each output."""
-
-    gain: np.ndarray
-    rate: np.ndarray
-    delay: np.ndarray
-    cap: np.ndarray
-    offset: np.ndarray
-    late: np.ndarray
-
-    @classmethod
-    def none(cls, m: int, p: int) -> "MachineChanges":
-        zeros = np.zeros(m)
-        return cls(zeros, zeros, zeros, np.full(m, np.inf), np.zeros(p), np.zeros(p))
+# of a machine against the model, one after the other: a share of a gain or of a rate (the inverse of a time
+# constant), samples of a delay or of a late sensor, the most that acts of an input, °C of an offset
+Changes = tuple[tuple[DriftCause, float], ...]
 
 
-FIELD = {
-    "gain": "gain",
-    "time constant": "rate",
-    "delay": "delay",
-    "saturation": "cap",
-    "offset": "offset",
-    "late sensor": "late",
-}
+def sizes(changes: Changes, kind: str, channel: int) -> list[float]:
+    """The changes of one kind that concern a channel."""
+    return [value for cause, value in changes if cause.kind == kind and cause.channel in (channel, -1)]
 
 
 class Scatter(NamedTuple):
@@ -141,20 +128,6 @@ def causes(plant: Plant) -> list[DriftCause]:
     ]
 
 
-def with_change(changes: MachineChanges, cause: DriftCause, value: float) -> MachineChanges:
-    """`changes` with that of one cause moved by `value`; a saturation is set to it."""
-    name = FIELD[cause.kind]
-    moved = getattr(changes, name).copy()
-    at = slice(None) if cause.channel < 0 else cause.channel
-    if cause.kind == "gain":
-        moved[at] = (1 + moved[at]) * (1 + value) - 1
-    elif cause.kind == "saturation":
-        moved[at] = value
-    else:
-        moved[at] = moved[at] + value
-    return changes._replace(**{name: moved})
-
-
 def faster(plant: Plant, share: float) -> Plant:
     """The plant with every rate 1 + share as high, its time constants 1 / (1 + share) as long, its steady
     gains the same: expm((1 + share) log [A B b; 0 I]).
@@ -162,19 +135,16 @@ def faster(plant: Plant, share: float) -> Plant:
     A plant whose logarithm is not real (dead times, poles on the negative axis) has
     its slow modes quickened, I - (1 + share) (I - A).
     """
-    n, m = plant.n, plant.m
-    rate = 1.0 + share
+    n, m, rate = plant.n, plant.m, 1.0 + share
     augmented = np.block([[plant.A, plant.B, plant.b[:, None]], [np.zeros((m + 1, n)), np.eye(m + 1)]])
     eigenvalues = np.linalg.eigvals(plant.A)
-    if (
-        np.abs(eigenvalues).min() > 0.05
-        and not ((eigenvalues.real < 0) & (np.abs(eigenvalues.imag) < 1e-9)).any()
-    ):
+    negative = (eigenvalues.real < 0) & (np.abs(eigenvalues.imag) < 1e-9)
+    if np.abs(eigenvalues).min() > 0.05 and not negative.any():
         with np.errstate(all="ignore"):
             power = scipy.linalg.expm(scipy.linalg.logm(augmented) * rate)
         if np.isfinite(power).all() and np.abs(power.imag).max() < 1e-6:
-            power = power.real
-            return plant._replace(A=power[:n, :n], B=power[:n, n : n + m], b=power[:n, -1])
+            A, B, b = np.split(power.real[:n], [n, n + m], axis=1)
+            return plant._replace(A=A, B=B, b=b[:, 0])
     eye = np.eye(n)
     return plant._replace(A=eye - (eye - plant.A) * rate, B=plant.B * rate, b=plant.b * rate)
 
@@ -191,44 +161,35 @@ def respond(plant: Plant, j: int, u: np.ndarray) -> np.ndarray:
 
 def shifted(values: np.ndarray, samples: float) -> np.ndarray:
     """values (T, ...) so many samples later, between samples by a straight line; the ends are held."""
+    if not samples:
+        return values
     at = np.clip(np.arange(len(values)) - samples, 0, len(values) - 1)
     low = np.floor(at).astype(int)
-    high, share = np.minimum(low + 1, len(values) - 1), at - low
-    share = share.reshape(-1, *[1] * (values.ndim - 1))
-    return (1 - share) * values[low] + share * values[high]
+    share = (at - low).reshape(-1, *[1] * (values.ndim - 1))
+    return (1 - share) * values[low] + share * values[np.minimum(low + 1, len(values) - 1)]
 
 
 class ProductionModel:
     """The champion's model, ready to be asked: a plant that is stable over the record, its observer's
-    gain K (n, p), and what it has already worked out."""
+    gain K (n, p), and `faster`, the plant with its rates so much higher, worked out once."""
 
     def __init__(self, plant: Plant, samples: int):
         self.plant = plant._replace(A=clip_spectral_radius(plant.A, 1.0 - 1.0 / max(samples, 10)))
-        own = plant.K
-        stable = np.abs(np.linalg.eigvals(self.plant.A - own @ plant.C)).max() < 1
-        self.K = own if stable else np.zeros_like(own)
-        self._faster: dict[float, Plant] = {0.0: self.plant}
-        self._gains: dict[float, np.ndarray] = {0.0: self.K}
+        stable = np.abs(np.linalg.eigvals(self.plant.A - plant.K @ plant.C)).max() < 1
+        self.K = plant.K if stable else np.zeros_like(plant.K)
+        self.faster = functools.cache(lambda share: faster(self.plant, share) if share else self.plant)
 
     def gain(self, draught: float, variance: np.ndarray) -> np.ndarray:
         """Kalman's gain (n, p) where draughts take so many percent from each input, sample by sample."""
-        if draught not in self._gains:
-            A, C, B = self.plant.A, self.plant.C, self.plant.B
-            Q = draught**2 * B @ B.T + self.K @ np.diag(variance) @ self.K.T + 1e-9 * np.eye(len(A))
-            try:
-                P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, np.diag(variance))
-            except (
-                np.linalg.LinAlgError
-            ):  # a mode on the unit circle that no output shows: draughts are not asked
-                P = None
-            forgets = None if P is None else A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + np.diag(variance))
-            self._gains[draught] = self.K if forgets is None else forgets
-        return self._gains[draught]
-
-    def faster(self, share: float) -> Plant:
-        if share not in self._faster:
-            self._faster[share] = faster(self.plant, share)
-        return self._faster[share]
+        A, B, C = self.plant.A, self.plant.B, self.plant.C
+        if not draught:
+            return self.K
+        Q = draught**2 * B @ B.T + self.K @ np.diag(variance) @ self.K.T + 1e-9 * np.eye(len(A))
+        try:
+            P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, np.diag(variance))
+        except np.linalg.LinAlgError:  # a mode on the unit circle that no output shows
+            return self.K
+        return A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + np.diag(variance))
 
     def innovation(self, values: np.ndarray, K: np.ndarray) -> np.ndarray:
         """S(q) values (T, p): what the observer of gain K does not foresee of an error of the output."""
@@ -251,13 +212,11 @@ class RecordSegment(NamedTuple):
 
 
 class DriftRecord(NamedTuple):
-    """Segments held against a machine at a scale, in a room, by an observer of gain K; `basis` is that of the
-    outputs' levels, which all segments share, and `common` (N, p) those levels before they were made
-    orthonormal."""
+    """Segments held against a machine at a scale by an observer of gain K; `basis` is that of the outputs'
+    levels, which all segments share, and `common` (N, p) those levels before they were made orthonormal."""
 
     machine: ProductionModel
     scale: Scatter
-    room: RoomAir
     K: np.ndarray
     segments: list[RecordSegment]
     basis: np.ndarray
@@ -268,24 +227,23 @@ def record(
     machine: ProductionModel, segments: Segments, scale: Scatter, room: RoomAir = RESTLESS
 ) -> DriftRecord:
     """A record ready to be asked. Raises ValueError where it is too short."""
-    plant = machine.plant
-    long = [(u, y) for u, y in segments if len(y) >= 4 * plant.n + 8]
-    if sum(len(y) for _, y in long) < SHORTEST:
+    n, p = machine.plant.n, machine.plant.p
+    long = [(u, y) for u, y in segments if len(y) >= 4 * n + 8]
+    if (samples := sum(len(y) for _, y in long)) < SHORTEST:
         raise ValueError(
             f"drift: expected records of at least {SHORTEST} samples to hold against the champion, "
-            f"found {sum(len(y) for _, y in long)}; record longer"
+            f"found {samples}; record longer"
         )
-    scale = _in(scale, room)
-    K, none = machine.gain(room.draught, scale.variance), np.zeros((0, 0))
-    made, bare = [], DriftRecord(machine, scale, room, K, [], none, none)
+    scale, none = _in(scale, room), np.zeros((0, 0))
+    bare = DriftRecord(machine, scale, machine.gain(room.draught, scale.variance), [], none, none)
     for u, y in long:
         measured = np.isfinite(y)
-        nuisance = _weighted(bare, _own_nuisances(machine, len(y), scale, room.course), measured)
-        columns = _held(nuisance, plant.n)
-        made.append(RecordSegment(u, y, measured, {}, columns, np.linalg.qr(columns)[0]))
-    bare, level = bare._replace(segments=made), np.diag(scale.level)
+        nuisances = _weighted(bare, _own_nuisances(machine, len(y), scale, room.course), measured)
+        columns = _held(nuisances, n)
+        bare.segments.append(RecordSegment(u, y, measured, {}, columns, np.linalg.qr(columns)[0]))
+    levels = [np.broadcast_to(np.diag(scale.level), (len(one.y), p, p)) for one in bare.segments]
     parts = [
-        _weighted(bare, np.broadcast_to(level, (len(one.y), *level.shape)), one.measured) for one in made
+        _weighted(bare, *each) for each in zip(levels, (one.measured for one in bare.segments), strict=True)
     ]
     common = _freed(bare, parts)
     return bare._replace(basis=np.linalg.qr(_held(common, 0))[0], common=common)
@@ -332,62 +290,57 @@ def _held(columns: np.ndarray, free: int) -> np.ndarray:
     return np.vstack([columns, np.diag(np.concatenate([np.full(free, 1e-6), np.ones(k - free)]))])
 
 
+def _padded(values: np.ndarray, rows: int) -> np.ndarray:
+    return np.concatenate([values, np.zeros((rows - len(values), *values.shape[1:]))])
+
+
 def _freed(record: DriftRecord, parts: Sequence[np.ndarray]) -> np.ndarray:
     """parts (T p, k) of each segment free of its own nuisances, one below the other."""
-    freed = []
-    for one, part in zip(record.segments, parts, strict=True):
-        Q = one.basis
-        padded = np.vstack([part, np.zeros((len(Q) - len(part), part.shape[1]))])
-        freed.append(padded - Q @ (Q.T @ padded))
-    return np.concatenate(freed)
+    padded = [_padded(part, len(one.basis)) for one, part in zip(record.segments, parts, strict=True)]
+    pairs = zip(record.segments, padded, strict=True)
+    return np.concatenate([part - one.basis @ (one.basis.T @ part) for one, part in pairs])
 
 
-def predicted(machine: ProductionModel, one: RecordSegment, changes: MachineChanges) -> np.ndarray:
+def predicted(machine: ProductionModel, one: RecordSegment, changes: Changes) -> np.ndarray:
     """y-hat (T, p) of a segment with these changes."""
     plant = machine.plant
     y = np.tile(plant.C @ np.linalg.solve(np.eye(plant.n) - plant.A, plant.b) + plant.d, (len(one.u), 1))
     for j in range(plant.m):
-        cap = float(changes.cap[j]) if changes.cap[j] < one.u[:, j].max() else np.inf
-        key = (j, float(changes.rate[j]), cap)
+        rate, delay = (sum(sizes(changes, kind, j)) for kind in ("time constant", "delay"))
+        cap = min(sizes(changes, "saturation", j), default=np.inf)
+        key = (j, rate, cap if cap < one.u[:, j].max() else np.inf)
         if key not in one.answers:
             if len(one.answers) > 60:
                 one.answers.clear()
-            one.answers[key] = respond(machine.faster(key[1]), j, np.minimum(one.u[:, j], cap))
-        answer = one.answers[key]
-        y += (1 + changes.gain[j]) * (shifted(answer, changes.delay[j]) if changes.delay[j] else answer)
-    for i in np.flatnonzero(changes.late):
-        y[:, i] = shifted(y[:, i], changes.late[i])
-    return y + changes.offset
+            one.answers[key] = respond(machine.faster(rate), j, np.minimum(one.u[:, j], cap))
+        gain = np.prod([1 + share for share in sizes(changes, "gain", j)])
+        y += gain * shifted(one.answers[key], delay)
+    for i in range(plant.p):
+        late, offset = (sum(sizes(changes, kind, i)) for kind in ("late sensor", "offset"))
+        y[:, i] = shifted(y[:, i], late) + offset
+    return y
 
 
-def left(record: DriftRecord, changes: MachineChanges) -> np.ndarray:
+def left(record: DriftRecord, changes: Changes) -> np.ndarray:
     """The one-step errors (N,) under these changes, in their own standard deviation and free of every
     nuisance, with what those cost."""
-    freed = _freed(record, _errors(record, changes))[:, 0]
     Q = record.basis
-    padded = np.concatenate([freed, np.zeros(len(Q) - len(freed))])
+    padded = _padded(_freed(record, _errors(record, changes))[:, 0], len(Q))
     return padded - Q @ (Q.T @ padded)
 
 
-def _errors(record: DriftRecord, changes: MachineChanges) -> list[np.ndarray]:
-    """(T p, 1) of each segment before any nuisance is taken off."""
+def _errors(record: DriftRecord, changes: Changes) -> list[np.ndarray]:
+    """(T p, 1) of each segment before any nuisance is taken off; what was not measured by a straight line
+    between its neighbours."""
     parts = []
     for one in record.segments:
         error = one.y - predicted(record.machine, one, changes) - record.scale.mean_level
-        error = _bridged(error, one.measured)
+        at = np.arange(len(error))
+        for i in np.flatnonzero(~one.measured.all(axis=0)):
+            known = one.measured[:, i]
+            error[:, i] = np.interp(at, at[known], error[known, i]) if known.any() else 0.0
         parts.append(_weighted(record, error[:, :, None], one.measured))
     return parts
-
-
-def _bridged(error: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """What was not measured by a straight line between its neighbours."""
-    if measured.all():
-        return error
-    error, at = error.copy(), np.arange(len(error))
-    for i in range(error.shape[1]):
-        there = measured[:, i]
-        error[:, i] = np.interp(at, at[there], error[there, i]) if there.any() else 0.0
-    return error
 
 
 def by_output(record: DriftRecord, rest: np.ndarray) -> np.ndarray:
@@ -401,11 +354,11 @@ def by_output(record: DriftRecord, rest: np.ndarray) -> np.ndarray:
 
 
 def room_of(
-    machine: ProductionModel, segments: Segments, scale: Scatter, changes: MachineChanges
+    machine: ProductionModel, segments: Segments, scale: Scatter, changes: Changes
 ) -> tuple[Scatter, RoomAir]:
     """The surroundings under which what is left of the record is likeliest, and the scale there: of draughts
     the one-step errors are larger than the champion's own, and the record itself says by how much."""
-    likeliest = (np.inf, scale, RESTLESS)
+    rooms = []
     for room in ROOMS:
         there = scale
         if room.draught:
@@ -416,113 +369,93 @@ def room_of(
         e = left(asked, changes)
         samples = sum(one.measured.sum(axis=0) for one in asked.segments)
         cost = float(e @ e + samples @ np.log(there.variance)) + _log_determinant(asked)
-        cost += DRAUGHTY if room.draught else 0.0
-        likeliest = min(likeliest, (cost, there, room), key=lambda found: found[0])
-    return likeliest[1], likeliest[2]
+        rooms.append((cost + DRAUGHTY * (room.draught > 0), there, room))
+    return min(rooms, key=lambda one: one[0])[1:]
 
 
 def _log_determinant(record: DriftRecord) -> float:
     """log det of the errors' covariance by what the nuisances add to it."""
-    R = [np.linalg.qr(one.columns, mode="r") for one in record.segments]
-    R.append(np.linalg.qr(_held(record.common, 0), mode="r"))
-    return float(sum(2 * np.log(np.abs(np.diag(one))).sum() for one in R))
+    columns = [*(one.columns for one in record.segments), _held(record.common, 0)]
+    return float(sum(2 * np.log(np.abs(np.diag(np.linalg.qr(one, mode="r")))).sum() for one in columns))
 
 
-def levels(record: DriftRecord, changes: MachineChanges) -> tuple[float, np.ndarray]:
+def levels(record: DriftRecord, changes: Changes) -> tuple[float, np.ndarray]:
     """°C by which the air around differs from what the model knows, and each output's own level (p,)."""
-    errors, k = _errors(record, changes), record.common.shape[1]
-    freed = _freed(record, errors)[:, 0]
-    rows = np.vstack([record.common, np.eye(k)])
-    share = np.linalg.lstsq(rows, np.concatenate([freed, np.zeros(k)]), rcond=None)[0]
-    n, airs, weights = record.machine.plant.n, [], []
-    for one, error in zip(record.segments, errors, strict=True):
-        level = np.broadcast_to(np.diag(record.scale.level), (len(one.y), k, k))
-        own = error[:, 0] - _weighted(record, level, one.measured) @ share
-        airs.append(np.linalg.solve(one.columns.T @ one.columns, one.columns.T @ _padded(own, one))[n])
-        weights.append(len(one.y))
-    return float(np.average(airs, weights=weights)) * record.scale.ambient, share * record.scale.level
-
-
-def air_deviation(record: DriftRecord) -> float:
-    """Standard deviation in °C of the air's level that `levels` gives."""
-    n, longest = record.machine.plant.n, max(record.segments, key=lambda one: len(one.y))
-    known = np.linalg.inv(longest.columns.T @ longest.columns)[n, n]
-    return float(np.sqrt(known)) * record.scale.ambient
-
-
-def _padded(values: np.ndarray, one: RecordSegment) -> np.ndarray:
-    return np.concatenate([values, np.zeros(len(one.columns) - len(values))])
+    rows, n = _held(record.common, 0), record.machine.plant.n
+    errors = _padded(_freed(record, _errors(record, changes))[:, 0], len(rows))
+    own = np.linalg.lstsq(rows, errors, rcond=None)[0] * record.scale.level
+    offsets = tuple((DriftCause("offset", i), float(level)) for i, level in enumerate(own))
+    pairs = zip(record.segments, _errors(record, (*changes, *offsets)), strict=True)
+    airs = [
+        np.linalg.lstsq(one.columns, _padded(error[:, 0], len(one.columns)), rcond=None)[0][n]
+        for one, error in pairs
+    ]
+    air = np.average(airs, weights=[len(one.y) for one in record.segments])
+    return float(air * record.scale.ambient), own
 
 
 # ---- one cause
 
 
 def fitted(
-    record: DriftRecord, changes: MachineChanges, cause: DriftCause, start: np.ndarray | None = None
+    record: DriftRecord, changes: Changes, cause: DriftCause, start: np.ndarray | None = None
 ) -> CauseFit:
     """The change of one cause that explains most beside `changes` (Gauss and Newton's steps); `start` (N,)
     are the errors left without it."""
+
+    def errors(value: float) -> np.ndarray:
+        return left(record, (*changes, (cause, value)))
+
     before = left(record, changes) if start is None else start
     if cause.kind == "saturation":
-        return _capped(record, changes, cause, before)
-    (step, low, high), value, J = RANGES[cause.kind], 0.0, float(before @ before)
-    e, whole = before, J
-    if cause.kind in ("delay", "late sensor"):
-        for guess in (6.0, 20.0, 40.0):
-            there = left(record, with_change(changes, cause, guess))
-            if (cost := float(there @ there)) < J:
-                e, value, J = there, guess, cost
-    psi = e - left(record, with_change(changes, cause, value + step))
+        return _capped(record, cause, before, errors)
+    (step, low, high), value, e = RANGES[cause.kind], 0.0, before
+    for guess in GUESSES.get(cause.kind, ()):
+        tried = errors(guess)
+        if tried @ tried < e @ e:
+            e, value = tried, guess
+    psi = e - errors(value + step)
     for _ in range(6):
         move = step * float(psi @ e) / max(float(psi @ psi), 1e-30)
-        tried = float(np.clip(value + move, low, high))
-        there = left(record, with_change(changes, cause, tried))
-        if (cost := float(there @ there)) >= J:
+        there = float(np.clip(value + move, low, high))
+        tried = errors(there)
+        if tried @ tried > e @ e - ENOUGH:
             break
-        done = J - cost < 0.01
-        e, value, J = there, tried, cost
-        psi = e - left(record, with_change(changes, cause, value + step))
-        if done:
-            break
-    return CauseFit(cause, value, _deviation(psi / step, e), whole - J)
+        e, value = tried, there
+        psi = e - errors(value + step)
+    return CauseFit(cause, value, _deviation(psi / step, e), float(before @ before - e @ e))
 
 
 def _deviation(psi: np.ndarray, e: np.ndarray) -> float:
     """Standard deviation of an estimate with sensitivity psi (N,) and errors e (N,): no less than white ones
     give, and robust to colour by the blocks' own scores."""
     information = max(float(psi @ psi), 1e-30)
-    scores = np.array([float(a @ b) for a, b in zip(_blocks(psi), _blocks(e), strict=True)])
+    scores = np.array([block.sum() for block in np.array_split(psi * e, BLOCKS)])
     return float(np.sqrt(max((scores**2).sum() * BLOCKS / (BLOCKS - 1), information)) / information)
 
 
-def _blocks(values: np.ndarray) -> list[np.ndarray]:
-    return np.array_split(values, BLOCKS)
-
-
-def _capped(record: DriftRecord, changes: MachineChanges, cause: DriftCause, before: np.ndarray) -> CauseFit:
-    """The level above which an input has no effect: the best of a fine grid, then Newton's steps."""
-    j = cause.channel
-    u = np.concatenate([one.u[:, j] for one in record.segments])
+def _capped(
+    record: DriftRecord, cause: DriftCause, before: np.ndarray, errors: Callable[[float], np.ndarray]
+) -> CauseFit:
+    """The level above which an input has no effect: the best of a fine grid, then between its neighbours
+    (Brent's method)."""
+    u = np.concatenate([one.u[:, cause.channel] for one in record.segments])
     low, high = float(u.min()), float(u.max())
-    whole = float(before @ before)
     if high - low < 1e-6:
         return CauseFit(cause, high, 1.0, 0.0)
-    grid = np.linspace(high, low - 0.5 * (high - low), 25)[1:]
 
     def cost(level: float) -> float:
-        e = left(record, with_change(changes, cause, level))
+        e = errors(float(level))
         return float(e @ e)
 
-    costs = [cost(level) for level in grid]
-    best, width = int(np.argmin(costs)), float(grid[0] - grid[1])
-    level, J = float(grid[best]), costs[best]
-    for _ in range(6):
-        width /= 2
-        J, level = min((J, level), *((cost(level + side), level + side) for side in (-width, width)))
-    e = left(record, with_change(changes, cause, level))
-    step = 0.05 * (high - low)
-    psi = (left(record, with_change(changes, cause, level - step)) - e) / step
-    return CauseFit(cause, level, _deviation(psi, e), max(whole - J, 0.0))
+    grid, width = np.linspace(high, low - 0.5 * (high - low), 25, retstep=True)
+    best = min(grid[1:], key=cost)
+    within = (best + width, best - width)
+    nearer = scipy.optimize.minimize_scalar(cost, bounds=within, method="bounded", options={"maxiter": 12}).x
+    level, step = float(min(best, nearer, key=cost)), 0.05 * (high - low)
+    e = errors(level)
+    psi = (errors(level - step) - e) / step
+    return CauseFit(cause, level, _deviation(psi, e), max(float(before @ before - e @ e), 0.0))
 
 
 def above(segments: Segments, j: int, level: float) -> float:
@@ -530,17 +463,17 @@ def above(segments: Segments, j: int, level: float) -> float:
     return 100 * float(np.mean(np.concatenate([u[:, j] for u, _ in segments]) > (1 + LOST) * level))
 
 
-def moved(record: DriftRecord, changes: MachineChanges, now: MachineChanges) -> np.ndarray:
+def moved(record: DriftRecord, changes: Changes, now: Changes) -> np.ndarray:
     """°C (p,) by which the outputs' level differs between two states of the machine under the record's
     inputs."""
-    parts = [
-        predicted(record.machine, one, now) - predicted(record.machine, one, changes)
-        for one in record.segments
-    ]
-    return np.abs(np.concatenate(parts).mean(axis=0))
+    outputs = (
+        np.concatenate([predicted(record.machine, one, state) for one in record.segments])
+        for state in (now, changes)
+    )
+    return np.abs(np.subtract(*outputs).mean(axis=0))
 
 
-def alone(record: DriftRecord, changes: MachineChanges) -> list[CauseFit]:
+def alone(record: DriftRecord, changes: Changes) -> list[CauseFit]:
     """Every cause, each as if it alone had changed."""
     before = left(record, changes)
     return [fitted(record, changes, cause, before) for cause in causes(record.machine.plant)]
@@ -562,36 +495,33 @@ class Explanation(NamedTuple):
 
     named: list[NamedCause]
     others: list[CauseFit]
-    changes: MachineChanges
+    changes: Changes
     left: np.ndarray
 
 
-def explain(record: DriftRecord, changes: MachineChanges, usual: Mapping[DriftCause, float]) -> Explanation:
+def explain(record: DriftRecord, changes: Changes, usual: Mapping[DriftCause, float]) -> Explanation:
     """Names what changed beside `changes`, one cause after the other; `usual` is what each cause explains of
     the champion's own records at most, which is no change of the machine."""
     now, fits, found = changes, alone(record, changes), []
-    for _ in range(MOST):
-        least = np.array([max(SURE**2, 2 * usual.get(fit.cause, 0.0)) for fit in fits])
-        worth = np.array([fit.explained for fit in fits])
-        if found:
-            least = np.maximum(least, REMAINDER * found[0].fit.explained)
-        surely = np.array([abs(_from_none(fit)) >= SURE for fit in fits])
-        worth = np.where((worth > least) & surely, worth, -np.inf)
-        best = int(worth.argmax())
+    while len(found) < MOST:
+        remainder = REMAINDER * found[0].fit.explained if found else 0.0
+        worth = np.array([
+            fit.explained
+            if abs(_from_none(fit)) >= SURE
+            and fit.explained > max(SURE**2, 2 * usual.get(fit.cause, 0.0), remainder)
+            else -np.inf
+            for fit in fits
+        ])  # fmt: skip
+        # transport is commoner than a late sensor, which is named if it explains more
+        behind = [RIVALS * _colour(fit) if fit.cause.kind == "late sensor" else 0.0 for fit in fits]
+        best = int((worth - behind).argmax())
         if not np.isfinite(worth[best]):
             break
-        if fits[best].cause.kind == "late sensor":
-            best = _rather_transport(fits, worth, best)
-        rivals = [
-            fit
-            for k, fit in enumerate(fits)
-            if k != best and worth[best] - worth[k] < RIVALS * _colour(fits[best])
-        ]
-        found.append(NamedCause(fits[best], rivals))
-        now = with_change(now, fits[best].cause, fits[best].value)
+        close = worth > worth[best] - RIVALS * _colour(fits[best])
+        found.append(NamedCause(fits[best], [fits[k] for k in np.flatnonzero(close) if k != best]))
+        now = (*now, fits[best][:2])
         before = left(record, now)
-        taken = {named.fit.cause for named in found}
-        fits = [fitted(record, now, fit.cause, before) for fit in fits if fit.cause not in taken]
+        fits = [fitted(record, now, fit.cause, before) for k, fit in enumerate(fits) if k != best]
     if len(found) > 1:
         found, now = _polished(record, changes, found)
     return Explanation(found, fits, now, left(record, now))
@@ -601,7 +531,7 @@ def explain_segments(
     machine: ProductionModel,
     segments: Segments,
     scale: Scatter,
-    changes: MachineChanges,
+    changes: Changes,
     usual: Mapping[DriftCause, float],
 ) -> tuple[DriftRecord, Explanation]:
     """A record explained in the surroundings that it was made in: asked first in restless ones, which
@@ -617,22 +547,13 @@ def explain_segments(
     rest = left(same, explained.changes)
     if not explained.named and float(rest @ rest - explained.left @ explained.left) < SURE**2:
         return same, Explanation([], alone(same, changes), changes, rest)
-    within = explain(same, changes, usual)
-    return min((same, within), (asked, explained), key=_cost)
+    return min((same, explain(same, changes, usual)), (asked, explained), key=_cost)
 
 
-def _cost(told: tuple[DriftRecord, Explanation]) -> float:
-    record, explained = told
+def _cost(candidate: tuple[DriftRecord, Explanation]) -> float:
+    record, explained = candidate
     unlikely = float(explained.left @ explained.left) + _log_determinant(record)
     return unlikely + CAUSE * len(explained.named)
-
-
-def _rather_transport(fits: Sequence[CauseFit], worth: np.ndarray, best: int) -> int:
-    """The delay of an input where a late sensor explains no more: transport is the commoner cause."""
-    for k, fit in enumerate(fits):
-        if fit.cause.kind == "delay" and worth[best] - worth[k] < RIVALS * _colour(fits[best]):
-            return k
-    return best
 
 
 def _from_none(fit: CauseFit) -> float:
@@ -650,20 +571,14 @@ def _colour(fit: CauseFit) -> float:
 
 
 def _polished(
-    record: DriftRecord, changes: MachineChanges, found: list[NamedCause]
-) -> tuple[list[NamedCause], MachineChanges]:
+    record: DriftRecord, changes: Changes, found: list[NamedCause]
+) -> tuple[list[NamedCause], Changes]:
     """Several causes fitted beside each other, in turns."""
-    fits = [named.fit for named in found]
     for _ in range(3):
-        for k, fit in enumerate(fits):
-            others = changes
-            for other in fits[:k] + fits[k + 1 :]:
-                others = with_change(others, other.cause, other.value)
-            fits[k] = fitted(record, others, fit.cause)
-    together = changes
-    for fit in fits:
-        together = with_change(together, fit.cause, fit.value)
-    return [named._replace(fit=fit) for named, fit in zip(found, fits, strict=True)], together
+        for k, named in enumerate(found):
+            others = [other.fit[:2] for other in found if other is not named]
+            found[k] = named._replace(fit=fitted(record, (*changes, *others), named.fit.cause))
+    return found, (*changes, *(named.fit[:2] for named in found))
 
 
 # ---- a figure against those of the champion's nights

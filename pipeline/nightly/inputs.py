@@ -11,7 +11,7 @@ from pathlib import Path
 
 import yaml
 
-from pipeline.nightly.processes import changed, names
+from pipeline.nightly.processes import git, names
 from pipeline.nightly.reproducing import outs_of, read_stages
 from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.recordings import excluded, plain_files
@@ -35,45 +35,33 @@ def sources() -> list[str]:
     )
 
 
-class Hashes:
-    """SHA-256 by path, remembered with size and time of change, so that a
-    gigabyte that did not change is not read every night."""
-
-    def __init__(self, remembered: Mapping[str, list]):
-        self.remembered = dict(remembered)
-        self.now: dict[str, list] = {}
-
-    def of(self, path: Path) -> str:
-        status = path.stat()
+def contents(places: Iterable[str], stamps: dict[str, list]) -> dict[str, str]:
+    """{path: SHA-256} of all files at or below `places` that a stage would read. `stamps` remembers {path:
+    [size, time of change, inode, digest]}, so that a gigabyte that did not change is not read every
+    night. Raises ValueError for a name that is no text, for what is no file, and for what cannot be read."""
+    found = [path for place in places for path in (Path(place), *sorted(Path(place).rglob("*")))]
+    files = [path for path in found if path.is_symlink() or (path.exists() and not path.is_dir())]
+    digests = {}
+    for file in files:
+        hidden = any(part.startswith(".") or part == "__pycache__" for part in file.parts)
+        if hidden or file.suffix == ".pyc" or plain_files.is_partial(file.name) or file.is_dir():
+            continue
+        _check(file)
+        path, status = file.as_posix(), file.stat()
         stamp = [status.st_size, status.st_mtime_ns, status.st_ino]
-        before = self.remembered.get(str(path))
-        same = bool(before) and before[:3] == stamp
-        try:
-            self.now[str(path)] = before if same else [*stamp, artifacts.sha256(path)]
-        except OSError as error:
-            raise ValueError(
-                f"{path} cannot be read ({error.strerror}); make it readable, or move it away"
-            ) from None
-        return self.now[str(path)][3]
-
-    def below(self, place: str) -> dict[str, str]:
-        """{path: digest} of a file, or of every file below a folder that a stage would read."""
-        path = Path(place)
-        relevant = [
-            file
-            for file in ([path] if path.is_file() else sorted(path.rglob("*")))
-            if not any(part.startswith(".") or part == "__pycache__" for part in file.parts)
-            and file.suffix != ".pyc"
-            and not plain_files.is_partial(file.name)
-            and not file.is_dir()
-        ]
-        for file in relevant:
-            _check(file)
-        return {file.as_posix(): self.of(file) for file in relevant}
+        if stamps.get(path, [])[:3] != stamp:
+            try:
+                stamps[path] = [*stamp, artifacts.sha256(file)]
+            except OSError as error:
+                raise ValueError(
+                    f"{path} cannot be read ({error.strerror}); make it readable, or move it away"
+                ) from None
+        digests[path] = stamps[path][3]
+    return digests
 
 
 def _check(file: Path) -> None:
-    """Raises ValueError where the name of a file is no text, which no JSON can hold, or where it is none that
+    """Raises ValueError if the name of a file is no text, which no JSON can hold, or if it is no file that
     can be read to its end."""
     try:
         file.as_posix().encode()
@@ -81,13 +69,8 @@ def _check(file: Path) -> None:
         shown = os.fsencode(file).decode("utf-8", "backslashreplace")
         raise ValueError(f"{shown}: expected a name in UTF-8, found bytes that are none; rename it") from None
     if not file.is_file():
-        found = "a link that leads nowhere" if file.is_symlink() else "a pipe or a device"
-        raise ValueError(f"{file}: expected a file, found {found}; move it away")
-
-
-def contents(hashes: Hashes, places: list[str]) -> dict[str, str]:
-    """{path: digest} of all that lies at `places`."""
-    return {name: content for place in places for name, content in hashes.below(place).items()}
+        kind = "a link that leads nowhere" if file.is_symlink() else "a pipe or a device"
+        raise ValueError(f"{file}: expected a file, found {kind}; move it away")
 
 
 def digest(digests: Mapping[str, str]) -> str:
@@ -103,21 +86,21 @@ def recordings(digests: Mapping[str, str], loop: NightlyLoop) -> dict[str, str]:
     are none, nor is what is excluded. A bag of ROS 2 is one recording, as `ingest` reads it, under the path
     of its folder."""
     folder, notes = loop.recordings, (".md", ".txt", ".yaml", ".dvc")
-    below = {name: content for name, content in digests.items() if folder and within(name, folder)}
-    bags: dict[str, dict[str, str]] = {}
-    if loop.judge == "temperature":
-        parents = {str(Path(name).parent) for name in below if Path(name).name == METADATA} - {folder}
-        # of a bag within a bag, the outer one is read
-        bags = {bag: {} for bag in parents if not any(within(bag, other) for other in parents)}
-    single: dict[str, str] = {}
-    for name, content in below.items():
-        bag = next((str(parent) for parent in Path(name).parents if str(parent) in bags), "")
-        if bag:
-            bags[bag][name] = content
-        elif not name.lower().endswith(notes):
-            single[name] = content
-    every = single | {bag: digest(files) for bag, files in bags.items()}
-    left_out = {path.as_posix() for path in excluded.exclusions(folder)} if folder else set()
+    if not folder:
+        return {}
+    below = {name: content for name, content in digests.items() if within(name, folder)}
+    parents = {str(Path(name).parent) for name in below if Path(name).name == METADATA} - {folder}
+    # of a bag within a bag, the outer one is read
+    bags = [
+        bag for bag in parents if loop.judge == "temperature" and not any(within(bag, one) for one in parents)
+    ]
+    every = {bag: digest({name: below[name] for name in below if within(name, bag)}) for bag in bags}
+    every |= {
+        name: content
+        for name, content in below.items()
+        if not lies_in(name, bags) and not name.lower().endswith(notes)
+    }
+    left_out = {path.as_posix() for path in excluded.exclusions(folder)}
     return {name: content for name, content in every.items() if not lies_in(name, left_out)}
 
 
@@ -162,28 +145,21 @@ def move_aside(path: str, loop: str, reason: str) -> None:
 
 
 def keeper(path: Path) -> str:
-    """Who has a version of what lies here: git, DVC, or nobody, which is empty."""
-    try:
-        if names("ls-files", "--", str(path)):
-            return "git"
-    except ValueError:  # no repository, or the path leads out of it
+    """Who has a version of what lies here: git, DVC, or nobody, which is empty. If the cache lacks the list
+    of a folder's files, DVC is taken to have it: what stays is not lost."""
+    if git("ls-files", "--", str(path), check=False):
+        return "git"
+    pointers = [folder.with_name(f"{folder.name}.dvc") for folder in (path, *path.parents) if folder.name]
+    pointer = next((pointer for pointer in pointers if pointer.is_file()), None)
+    if not pointer:
         return ""
-    for folder in (path, *path.parents):
-        pointer = folder.with_name(f"{folder.name}.dvc") if folder.name else Path()
-        if pointer.is_file():
-            return "DVC" if _holds(pointer, path.relative_to(folder).as_posix()) else ""
-    return ""
-
-
-def _holds(pointer: Path, name: str) -> bool:
-    """Whether the folder or file of a DVC pointer has a version with this path in it. Where the cache lacks
-    the list of the folder's files that cannot be told, and it is taken to: what stays is not lost."""
     md5 = str(yaml.safe_load(pointer.read_text(encoding="utf-8"))["outs"][0]["md5"])
-    files = Path(".dvc/cache/files/md5") / md5[:2] / md5[2:]
+    files = Path(".dvc/cache/files/md5", md5[:2], md5[2:])
     if not md5.endswith(".dir") or not files.is_file():
-        return True
-    held = [entry["relpath"] for entry in json.loads(files.read_text(encoding="utf-8"))]
-    return any(file == name or file.startswith(f"{name}/") for file in held)
+        return "DVC"
+    name = path.relative_to(pointer.with_suffix("")).as_posix()
+    kept = [entry["relpath"] for entry in json.loads(files.read_text(encoding="utf-8"))]
+    return "DVC" if any(lies_in(file, [name]) for file in kept) else ""
 
 
 def read_lists(settings: Nightly, copy: Path) -> dict[str, str]:
@@ -199,20 +175,23 @@ def read_lists(settings: Nightly, copy: Path) -> dict[str, str]:
 def recorded_places(settings: Nightly) -> list[str]:
     """Where recordings lie; of a folder that DVC keeps, git keeps the pointer alone."""
     places = [*(loop.recordings for loop in settings.loops.values()), settings.holdout.recordings]
-    return [
-        pointer if Path(pointer := f"{place}.dvc").exists() else place
-        for place in dict.fromkeys(places)
-        if place
-    ]
+    pointers = {place: f"{place}.dvc" for place in places if place}
+    return [pointer if Path(pointer).exists() else place for place, pointer in pointers.items()]
 
 
 def find_uncommitted(settings: Nightly) -> list[str]:
     """Code, parameters and other sources that differ from the last commit, or are in none. What a night's own
     commit holds, recordings among it, is none of these."""
-    own = ["dvc.lock", "reports", "champion.json", "champion", "datasets/.gitignore"]
-    own += recorded_places(settings) + [
-        loop.recordings for loop in settings.loops.values() if loop.recordings
+    own = [
+        "dvc.lock",
+        "reports",
+        "champion.json",
+        "champion",
+        "datasets/.gitignore",
+        *recorded_places(settings),
     ]
+    own += [loop.recordings for loop in settings.loops.values() if loop.recordings]
+    paths = {*names("diff", "--name-only", "--no-renames", "HEAD")}
     code = [name for name in sources() if not lies_in(name, own)]
-    paths = {*changed(), *(changed(*code, untracked="all") if code else ())}
+    paths |= {*(names("ls-files", "--others", "--exclude-standard", "--", *code) if code else ())}
     return sorted(path for path in paths if not lies_in(path, own))

@@ -3,7 +3,7 @@ from; any loop from a file of costs by case."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import joblib
 import numpy as np
@@ -28,13 +28,13 @@ from stages.ingest import Ingest, recording_wish
 from stages.tune_weights import read_models
 
 MEMO = Path("datasets/memo/panel")
-PAGE, EARLIER = "page", "varx_riccati"  # of nightly.holdout.controller
+PAGE = "page"  # of nightly.holdout.controller: the contestant that the page names
 
 
 class Judge(NamedTuple):
     """`measure(folder, contestant)`: the evidence on a controller whose files lie below the folder (datasets,
-    or champion/<loop>); of the temperature loop, on the contestant of that name, `declared` where it is left
-    out. `allowed(champion)`: how much worse each guard may be."""
+    or champion/<loop>); of the temperature loop, on the contestant of that name, or if it is empty on the one
+    that nightly.holdout.controller names. `allowed(champion)`: how much worse each guard may be."""
 
     measure: Callable[..., CaseCosts]
     allowed: Callable[[CaseCosts], dict[str, float]]
@@ -163,14 +163,8 @@ DESIGNED_FROM = {
 def _temperature(settings: Nightly) -> Callable[..., CaseCosts]:
     """Closed loop on every plant of the frozen panel, as deployed; prediction on the hold-out recordings."""
     frozen = frozen_panel(settings.holdout)
-    own = declared(settings.holdout)
-    return lambda folder, contestant=own: _closed_loop(frozen, folder, contestant, settings.rule)
-
-
-def declared(holdout: HoldOut) -> str:
-    """The contestant that section nightly.holdout names; where it leaves that to the page, the one that ran
-    before champion.json said which."""
-    return EARLIER if holdout.controller == PAGE else holdout.controller
+    own = settings.holdout.controller
+    return lambda folder, contestant="": _closed_loop(frozen, folder, contestant or own, settings.rule)
 
 
 def frozen_panel(holdout: HoldOut) -> FrozenPanel:
@@ -259,12 +253,26 @@ def judged(frozen: FrozenPanel, folder: Path, name: str) -> evaluation.Controlle
 
 
 def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[Design, panel.CaseConditions]:
-    machine, tracking = frozen.machine, frozen.tracking
-    models = _models(folder, name, machine)
+    machine, tracking, path = frozen.machine, frozen.tracking, folder / "tune_weights/weights.json"
+    spread, pid = folder / "identify_plant/spread.parquet", folder / "ingest/printer_pid.json"
+    models = read_models(
+        folder / "identify_plant/plant.parquet",
+        spread if spread.exists() else None,
+        folder / "learn_kernel",
+        pid if pid.exists() else None,
+        machine,
+    )
     setting = panel.conditions(
         frozen.tuning, machine, tracking, frozen.settings, frozen.rehearsal, models["family"]
     )
-    values, tuned_for = _tuned(folder / "tune_weights/weights.json", name, machine)
+    stored = artifacts.read_json(path)
+    tuned, tuned_for = stored.get("contestants", {}).get(name, {}), stored.get("design", {})
+    values = {one.name: tuned.get(one.name) for one in table.BY_NAME[name].parameters}
+    if None in values.values():
+        raise ValueError(
+            f"{path}: expected the tuned parameters of {name}, {', '.join(values)}, found "
+            f"{', '.join(tuned) or 'none'}; let tune_weights tune it"
+        )
     # what it was tuned for, not what it is judged by
     problem = panel.design_problem(models, tracking, setting, None)._replace(
         horizon=int(tuned_for.get("horizon_steps", frozen.settings.steps)),
@@ -274,51 +282,6 @@ def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[Design, pan
     if design is None:
         raise ValueError(f"{folder}: expected what {name} is designed from, found that its record has none")
     return design, setting
-
-
-def _tuned(path: Path, name: str, machine: Machine) -> tuple[dict[str, float], dict[str, Any]]:
-    """The tuned parameters of a controller, and what they were tuned for. A champion's file may be of another
-    version, which wrote other keys beside them. Raises ValueError for a file without these parameters, and
-    for one of another machine."""
-    stored = artifacts.read_json(path)
-    tuned = stored.get("contestants")
-    if not tuned:
-        raise ValueError(
-            f"{path}: expected contestants with their tuned parameters, found {', '.join(stored) or 'none'}, "
-            f"as in a file of an older version; {artifacts.remedy(path)}"
-        )
-    own = tuned.get(name, {})
-    for key, signals, what in (("q", machine.outputs, "outputs"), ("r", machine.inputs, "inputs")):
-        if len(own.get(key, signals)) != len(signals):
-            raise ValueError(
-                f"{path}: contestants.{name}.{key} has {len(own[key])} weights but the machine in "
-                f"params.yaml has {len(signals)} {what}; {artifacts.remedy(path)}"
-            )
-    values = {one.name: own.get(one.name) for one in table.BY_NAME[name].parameters}
-    if lacking := [key for key, value in values.items() if not (value and 0 < value < np.inf)]:
-        raise ValueError(
-            f"{path}: expected {', '.join(lacking)} of {name}, found none; let tune_weights tune it, or name "
-            f"one of {', '.join(tuned)} in nightly.holdout.controller"
-        )
-    return values, stored.get("design", {})
-
-
-def _models(folder: Path, name: str, machine: Machine) -> dict[str, Any]:
-    """What a contestant is designed from; of what only some need, what lies there."""
-    own = DESIGNED_FROM.get(name)
-    if own and not (folder / own).exists():
-        raise ValueError(
-            f"{folder / own}: expected it, from which {name} is designed, found none; add datasets/{own} to "
-            "nightly.loops.temperature.artifacts, or name another one in nightly.holdout.controller"
-        )
-    spread, pid = folder / "identify_plant/spread.parquet", folder / "ingest/printer_pid.json"
-    return read_models(
-        folder / "identify_plant/plant.parquet",
-        spread if spread.exists() else None,
-        folder / "learn_kernel",
-        pid if pid.exists() else None,
-        machine,
-    )
 
 
 def identified(folder: Path) -> plant.Plant:
@@ -341,7 +304,8 @@ def _holdout_records(h: HoldOut, machine: Machine) -> list[tuple[np.ndarray, np.
             f"{h.recordings}: expected recordings that nothing is trained on, found none; "
             "put one of the machine as commissioned there"
         )
-    return [pair for pairs in record_segments(Path(h.recordings), machine).values() for pair in pairs]
+    records = read_records(Path(h.recordings), machine)
+    return [pair for result in records.values() for pair in segments(result.record, machine)]
 
 
 def measure_shares(settings: Nightly, paths: Sequence[str]) -> dict[str, dict[str, float]]:
@@ -372,14 +336,6 @@ def _is_recorded() -> bool:
     return params.value("generate_probing.source", one_of=("simulated", "recordings")) == "recordings"
 
 
-def record_segments(
-    folder: Path, machine: Machine, *, broken: dict[str, str] | None = None
-) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-    """{recording: [(u, y), ...]} below a folder, as `read_records` reads them."""
-    records = read_records(folder, machine, broken)
-    return {name: segments(result.record, machine) for name, result in records.items()}
-
-
 def read_records(
     folder: Path, machine: Machine, broken: dict[str, str] | None = None
 ) -> dict[str, RecordingTable]:
@@ -394,17 +350,12 @@ def read_records(
         memo=Path("datasets/memo/ingest"),
         budget=Budget(settings.longest_s, settings.largest_mb),
     )
-    records = {}
-    for result in results:
-        if result.passed_over:
-            continue
-        if result.reason:
-            if broken is None:
-                raise ValueError(result.reason)
-            broken[result.name] = result.reason
-            continue
-        records[result.name] = result
-    return records
+    read = [result for result in results if not result.passed_over]
+    reasons = {result.name: result.reason for result in read if result.reason}
+    if reasons and broken is None:
+        raise ValueError(next(iter(reasons.values())))
+    (broken if broken is not None else {}).update(reasons)
+    return {result.name: result for result in read if not result.reason}
 
 
 def segments(

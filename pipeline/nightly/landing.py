@@ -74,10 +74,10 @@ def commit(paths: Sequence[str], message: str, parents: Sequence[str]) -> str:
     existing = [
         path
         for path in paths
-        if (COPY / path).exists() or any(inputs.lies_in(name, [path]) for name in tracked)
+        if ((COPY / path).exists() or any(inputs.lies_in(name, [path]) for name in tracked))
+        and not git("check-ignore", path, check=False, place=COPY)
+        and not _is_linked(COPY, path)
     ]
-    existing = [path for path in existing if not git("check-ignore", path, check=False, place=COPY)]
-    existing = [path for path in existing if not _is_linked(COPY, path)]
     if existing:
         git("add", "-A", "--", *existing, env=env, place=COPY)
     # a link to another disk in the copy is a file in the project, and the other way round
@@ -137,27 +137,27 @@ def finish() -> list[str]:
 
 def _bring_files(landing: Landing) -> list[str]:
     """Brings the files of the commit into the project and its index."""
-    paths = names("diff", "--name-only", "--no-renames", landing.before, landing.commit)
-    deleted = names("diff", "--name-only", "--no-renames", "--diff-filter=D", landing.before, landing.commit)
-    staged = {*names("diff", "--cached", "--name-only", "--no-renames", landing.before)}
+
+    def differ(*between: str) -> list[str]:
+        return names("diff", "--name-only", "--no-renames", *between)
+
+    paths = differ(landing.before, landing.commit)
+    deleted = differ("--diff-filter=D", landing.before, landing.commit)
+    staged = differ("--cached", landing.before)
     # no reference holds that commit: a clean-up of git may have taken it
     files = git("rev-parse", "-q", "--verify", f"{landing.files}^{{commit}}", check=False) or landing.before
-    edited = {*names("diff", "--name-only", "--no-renames", files)}
+    edited = differ(files)
     tracked = {*names("ls-tree", "-r", "--name-only", files)}
     # what git did not know when the night began, a new recording, lies there already
     bring = [name for name in paths if name not in edited and (name in tracked or not Path(name).exists())]
-    for name in (name for name in bring if name in deleted):
+    for name in {*bring} & {*deleted}:
         Path(name).unlink(missing_ok=True)
     written = [name for name in bring if name not in deleted]
     _call_with_paths("checkout", "-q", landing.commit, paths=written)
     unstaged = [name for name in paths if name not in staged and name not in written]
     _call_with_paths("reset", "-q", landing.commit, paths=unstaged)
-    differing = {*names("diff", "--name-only", "--no-renames", landing.commit)}
-    return [
-        f"{name} was edited meanwhile and is left as it is"
-        for name in paths
-        if name in edited and name in differing
-    ]
+    both = {*paths} & {*edited} & {*differ(landing.commit)}
+    return [f"{name} was edited meanwhile and is left as it is" for name in sorted(both)]
 
 
 def _changed_stages(landing: Landing) -> list[str]:

@@ -8,7 +8,7 @@ likeliest mistake is named all the same.
 """
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,9 +23,20 @@ AS_MUCH = 2.0  # a change of the machine that leaves up to so much more explains
 ROOM = drift.RESTLESS._replace(another_season=False)  # the air is not 48 °C warmer: that is °F
 # what is left with two mistakes undone that a record does not tell apart: one sensor, or every one
 ALIKE = 2.0
-FARTHEST = 128  # samples by which a clock is looked for
-
-Undo = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+# samples by which a clock is looked for, before those between
+CLOCKS = [late for far in (2, *range(4, 129, 4)) for late in (far, -far)]
+# what is written, and the factor and the offset that undo it
+OF_SENSORS = (
+    ("in °F where °C is declared", 1 / 1.8, -32 / 1.8),
+    ("in K where °C is declared", 1.0, -273.15),
+    ("written 10 times too large", 0.1, 0.0),
+    ("written 10 times too small", 10.0, 0.0),
+)
+OF_INPUTS = (
+    ("in shares of 1 where percent is declared", 100.0, 0.0),
+    ("in counts of 255 where percent is declared", 100 / 255, 0.0),
+    *OF_SENSORS[2:],
+)
 
 
 class Mistake(NamedTuple):
@@ -88,7 +99,6 @@ def likeliest(
     Sensors that are scaled down err less for that alone: what is compared is the likelihood of the record as
     it was written, |e|^2 / samples - 2 log scale, which takes the density of what was undone to its units.
     """
-    as_is = baseline.misfit(drift.record(machine, segments, own.scale, ROOM), own.changes)
 
     def left(undone: Segments) -> float:
         try:
@@ -96,13 +106,23 @@ def likeliest(
         except ValueError:  # nothing is left of it
             return np.inf
 
+    as_is = baseline.misfit(drift.record(machine, segments, own.scale, ROOM), own.changes)
     tried = []
-    for words, undo, scale in (*_swaps(inputs, outputs), *_units(inputs, outputs)):
-        undone = [undo(u, y) for u, y in segments]
+    for words, side, order, factor, offset in _list_written(inputs, outputs):
+        undone: Segments = [
+            (u, y[:, order] * factor + offset) if side else (u[:, order] * factor + offset, y)
+            for u, y in segments
+        ]
         rest = left(undone)
-        tried.append((rest - 2 * np.log(scale), rest, words, undone))
-    rest, words, undone = _clock(segments, left, machine.plant.sample_time_s)
-    tried.append((rest, rest, words, undone))
+        scale = np.log(factor).mean() if side else 0.0
+        tried.append((rest - 2 * scale, rest, words, undone))
+    costs = {late: left(_move(segments, late)) for late in CLOCKS}
+    nearest = min(costs, key=costs.__getitem__)
+    costs |= {late: left(_move(segments, late)) for late in range(nearest - 3, nearest + 4) if late}
+    late = min(costs, key=costs.__getitem__)
+    words = f"{abs(late) * machine.plant.sample_time_s:g} s {'late' if late > 0 else 'early'}"
+    words = f"the clock of the outputs is {words} against that of the inputs"
+    tried.append((costs[late], costs[late], words, _move(segments, late)))
     (least, rest, words, undone), *others = sorted(tried, key=lambda one: one[0])
     as_good = [
         other
@@ -112,73 +132,23 @@ def likeliest(
     return Mistake(", or ".join([words, *as_good]), undone, rest, as_is / rest)
 
 
-def _swaps(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo, float]]:
-    for j, i in itertools.combinations(range(len(outputs)), 2):
-        words = f"the sensors {outputs[j]} and {outputs[i]} are swapped"
-        yield words, lambda u, y, at=(i, j): (u, _swapped(y, at)), 1.0
-    for j, i in itertools.combinations(range(len(inputs)), 2):
-        words = f"the inputs {inputs[j]} and {inputs[i]} are swapped"
-        yield words, lambda u, y, at=(i, j): (_swapped(u, at), y), 1.0
+def _list_written(
+    inputs: Sequence[str], outputs: Sequence[str]
+) -> Iterator[tuple[str, int, np.ndarray, np.ndarray, np.ndarray]]:
+    """Signals that are swapped, and wrong units and factors of every one and of each: in words, whether of
+    inputs (0) or outputs (1), and what undoes it: the order of the columns, their factors and offsets."""
+    for side, noun, names, kinds in ((1, "sensor", outputs, OF_SENSORS), (0, "input", inputs, OF_INPUTS)):
+        order, every = np.arange(len(names)), np.ones(len(names))
+        for i, j in itertools.combinations(order, 2):
+            swapped = order.copy()
+            swapped[[i, j]] = j, i
+            yield f"the {noun}s {names[i]} and {names[j]} are swapped", side, swapped, every, 0 * every
+        for name, at in ((f"every {noun}", every), *zip(names, np.eye(len(names)), strict=True)):
+            for words, factor, offset in kinds:
+                yield f"{name} is {words}", side, order, factor**at, offset * at
 
 
-def _swapped(values: np.ndarray, at: tuple[int, int]) -> np.ndarray:
-    values = values.copy()
-    values[:, list(at)] = values[:, list(at)[::-1]]
-    return values
-
-
-def _units(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo, float]]:
-    """Wrong units and factors, of every signal and of each; last the factor by which undoing it scales the
-    outputs' errors, their geometric mean."""
-    every = slice(None)
-    sensors = (
-        ("in °F where °C is declared", 1 / 1.8, -32 / 1.8),
-        ("in K where °C is declared", 1.0, -273.15),
-        ("written 10 times too large", 0.1, 0.0),
-        ("written 10 times too small", 10.0, 0.0),
-    )
-    heaters = (
-        ("in shares of 1 where percent is declared", 100.0),
-        ("in counts of 255 where percent is declared", 100 / 255),
-        ("written 10 times too large", 0.1),
-        ("written 10 times too small", 10.0),
-    )
-    for at, name in ((every, "every sensor"), *enumerate(outputs)):
-        for unit, factor, offset in sensors:
-            change = (at, factor, offset)
-            scale = factor if at == every else factor ** (1 / len(outputs))
-            yield f"{name} is {unit}", lambda u, y, change=change: (u, _scaled(y, *change)), scale
-    for at, name in ((every, "every input"), *enumerate(inputs)):
-        for unit, factor in heaters:
-            change = (at, factor, 0.0)
-            yield f"{name} is {unit}", lambda u, y, change=change: (_scaled(u, *change), y), 1.0
-
-
-def _scaled(values: np.ndarray, at: int | slice, factor: float, offset: float) -> np.ndarray:
-    values = values.copy()
-    values[:, at] = factor * values[:, at] + offset
-    return values
-
-
-def _clock(
-    segments: Segments, left: Callable[[Segments], float], sample_time_s: float
-) -> tuple[float, str, Segments]:
-    """Outputs written so many samples later than inputs, or earlier: the best of a grid, then of its
-    neighbours."""
-    grid = [k * side for k in (2, *range(4, FARTHEST + 1, 4)) for side in (1, -1)]
-    costs = {k: left(_moved(segments, k)) for k in grid}
-    at, step = min(costs, key=costs.__getitem__), 2
-    while step:
-        for k in (at - step, at + step):
-            if k and k not in costs:
-                costs[k] = left(_moved(segments, k))
-        at, step = min(costs, key=costs.__getitem__), step // 2
-    word = "late" if at > 0 else "early"
-    words = f"the clock of the outputs is {abs(at) * sample_time_s:g} s {word} against that of the inputs"
-    return costs[at], words, _moved(segments, at)
-
-
-def _moved(segments: Segments, late: int) -> Segments:
+def _move(segments: Segments, late: int) -> Segments:
     """The outputs brought forward by so many samples; what has no partner is left out."""
     if late > 0:
         return [(u[:-late], y[late:]) for u, y in segments if len(y) > late]

@@ -27,7 +27,7 @@ from pipeline.nightly import (
 )
 from pipeline.nightly.landing import Landing
 from pipeline.nightly.processes import dvc, git, names
-from pipeline.nightly.records import ChampionState, LoopDecision, Memory, Night
+from pipeline.nightly.records import ChampionState, LoopDecision, Memory, Night, to_json
 from pipeline.nightly.remembered import METRICS
 from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.nightly.worktree import COPY, Snapshot
@@ -79,42 +79,43 @@ def _run(now: datetime.datetime, render: reporting.Render) -> tuple[int, str]:
     last, notes = remembered.read_or_set_aside()
     number = last.night + 1
     night = Night(number, f"night-{number:04d}", watch.stamp(now), notes=notes)
-    memory, settings, hashes = copy.copy(last), None, inputs.Hashes(last.hashes)
+    memory, settings = copy.copy(last), None
+    memory.hashes = {path: stamp for path, stamp in last.hashes.items() if Path(path).exists()}
     try:
         try:
             settings = params.load(Nightly, "nightly")
         finally:  # what a killed night left is put right whatever the parameters are
             night.notes += [*worktree.clear_killed(), *landing.finish(), *champion.follow()]
-        _work(settings, last, memory, hashes, night)
+        _work(settings, last, memory, night)
     except Exception as error:  # refused in a sentence, or a mistake of this program
-        _fail(night, error)
+        night.notes += _fail(night, reporting.tell(error, night.run))
     worktree.remove()  # on a full disk, what follows needs the room
     night.seconds = round(time.monotonic() - clock, 1)
     if last.success and settings and (overdue := watch.find_overdue(now, last.success, settings.watch_h)):
         night.notes.append(f"watch: {overdue}")
     if night.outcome == records.FAILED:
         # a recording of a failed night is new again the next one, and must not count as two
-        memory = last
+        last.hashes, memory = memory.hashes, last
     else:
         memory.unpushed, memory.idle = night.unpushed, night.idle
         # a night that lost a loop is repeated
         memory.inputs, memory.success = ("", last.success) if night.lost else (memory.inputs, night.when)
-    memory.night, memory.hashes = number, hashes.now or last.hashes
+    memory.night = number
     return reporting.report(night, memory, settings, render)
 
 
-def _fail(night: Night, error: Exception) -> None:
-    """A night that has made its commit stays what it was, and the next one finishes it."""
-    why = reporting.tell(error, night.run)
+def _fail(night: Night, why: str) -> list[str]:
+    """A night that has made its commit stays what it was, and the next one finishes it. What is left to
+    say."""
     if night.commit:
         night.unpushed = True
-        night.notes.append(why)
-    else:
-        night.decisions, night.branch = {}, ""
-        night.end(records.FAILED, why)
+        return [why]
+    night.decisions, night.branch = {}, ""
+    night.end(records.FAILED, why)
+    return []
 
 
-def _work(settings: Nightly, last: Memory, memory: Memory, hashes: inputs.Hashes, night: Night) -> None:
+def _work(settings: Nightly, last: Memory, memory: Memory, night: Night) -> None:
     """The work of a night, which `night` tells and `memory` remembers. What it raises ends the night, which
     keeps what it came to until then."""
     settings = _leave_out_loops(settings, memory, night)
@@ -122,9 +123,14 @@ def _work(settings: Nightly, last: Memory, memory: Memory, hashes: inputs.Hashes
         night.end(records.NOTHING_NEW, "section loops switches off every loop")
         return
     _check(settings)
-    places = _list_places(settings)
-    digests = inputs.contents(hashes, places)
-    if _is_known(digests, last):
+    folders = [loop.recordings for loop in settings.loops.values() if loop.recordings]
+    places = [*inputs.sources(), settings.holdout.recordings, *folders]
+    digests = inputs.contents(places, memory.hashes)
+
+    def is_known() -> bool:
+        return inputs.digest(digests) == last.inputs and not last.unpushed
+
+    if is_known():
         _note_idle(night, last.idle + 1)
         night.end(records.NOTHING_NEW, "no recording, parameter or code has changed since the last night")
         return
@@ -134,31 +140,29 @@ def _work(settings: Nightly, last: Memory, memory: Memory, hashes: inputs.Hashes
     with contextlib.chdir(COPY):
         for name, one in state.folders.items():
             champion.bring(name, one)
-        digests = inputs.contents(hashes, places)
+        digests = inputs.contents(places, memory.hashes)
         _find_new(settings, last, digests, night)
         _screen(settings, state, memory, night)
-        digests = inputs.contents(hashes, places)
+        digests = inputs.contents(places, memory.hashes)
     recordings = {name: inputs.recordings(digests, loop) for name, loop in settings.loops.items()}
     memory.recordings, memory.inputs = last.recordings | recordings, inputs.digest(digests)
-    aside = {path: artifacts.sha256(path) for path in night.drift.quarantined if _is_moved(path)}
-    if _is_known(digests, last):
+    # what was set aside in the copy is to be moved out of the project too
+    moved = [path for path in night.drift.quarantined if Path(path).exists() and not (COPY / path).exists()]
+    aside = {path: artifacts.sha256(path) for path in moved}
+    if is_known():
         night.end(records.QUARANTINED, "all that was new is quarantined")
     else:
-        lineage = {
-            "commit": snapshot.head,
-            "uncommitted": uncommitted,
-            "params": {name: digests[name] for name in (params.FILE, params.EXPERT) if name in digests},
-            "recordings": recordings,
-        }
+        lineage = {"commit": snapshot.head, "uncommitted": uncommitted}
         with contextlib.chdir(COPY):
             state = _learn(settings, state, night, lineage)
-            if moved := sorted(
-                {name for name, _ in digests.items() ^ inputs.contents(hashes, places).items()}
-            ):
-                raise ValueError(
-                    f"{moved[0]} changed while the stages ran; nothing is changed, and the next night learns "
-                    "from it"
-                )
+            changed = sorted(
+                {name for name, _ in digests.items() ^ inputs.contents(places, memory.hashes).items()}
+            )
+        if changed:
+            raise ValueError(
+                f"{changed[0]} changed while the stages ran; nothing is changed, and the next night learns "
+                "from it"
+            )
     if uncommitted:
         night.notes.append(
             f"not committed: {_name_few(uncommitted)}; no commit alone makes this night's result again"
@@ -201,16 +205,6 @@ def _check(settings: Nightly) -> None:
         )
 
 
-def _list_places(settings: Nightly) -> list[str]:
-    """All that a night is made from."""
-    recordings = [loop.recordings for loop in settings.loops.values() if loop.recordings]
-    return [*inputs.sources(), settings.holdout.recordings, *recordings]
-
-
-def _is_known(digests: Mapping[str, str], last: Memory) -> bool:
-    return inputs.digest(digests) == last.inputs and not last.unpushed
-
-
 def _note_idle(night: Night, nights: int) -> None:
     night.idle = nights
     running = f" for {nights} nights" if nights > 1 else ""
@@ -221,9 +215,9 @@ def _find_new(settings: Nightly, last: Memory, digests: Mapping[str, str], night
     """The recordings of each loop whose content was not there the night before, or how long there was
     none."""
     for name, loop in settings.loops.items():
-        seen_before = last.recordings.get(name, {}).values()
+        known = last.recordings.get(name, {}).values()
         recordings = inputs.recordings(digests, loop).items()
-        if new := sorted(path for path, content in recordings if content not in seen_before):
+        if new := sorted(path for path, content in recordings if content not in known):
             night.new_recordings[name] = new
             night.notes += _tell_unused(loop, new)
     if not night.new_recordings:
@@ -264,11 +258,6 @@ def _screen(settings: Nightly, state: ChampionState, memory: Memory, night: Nigh
     ]
 
 
-def _is_moved(path: str) -> bool:
-    """Whether a recording that was set aside is to be moved out of the project too."""
-    return Path(path).exists() and not (COPY / path).exists()
-
-
 # ---- the stages, and the judge
 
 
@@ -296,8 +285,7 @@ def _learn(
         for name, why in lost.items()
     }
     loops = {name: loop for name, loop in settings.loops.items() if name not in lost}
-    rest = settings.model_copy(update={"loops": loops})
-    return promoting.judge_all(rest, night, state, lineage)
+    return promoting.judge_all(settings.model_copy(update={"loops": loops}), night, state, lineage)
 
 
 # ---- the commit, which is the promotion
@@ -320,7 +308,7 @@ def _land(
     night.branch = settings.branch if by_branch and promoted else ""
     with contextlib.chdir(COPY):
         if state != before:
-            champion.write(state)
+            artifacts.write_json(champion.FILE, to_json(state))
             tracked += champion.paths(state)
         if not by_branch or promoted:
             artifacts.write_json(METRICS, night.metrics(state))
@@ -336,22 +324,22 @@ def _land(
     waiting = [tip for tip in tips.values() if git("merge-base", tip, head, check=False) != tip]
     made = landing.commit(tracked, message, [head, *dict.fromkeys(waiting)])
     figures_alone = made and {*names("diff", "--name-only", head, made)} <= {METRICS}
-    if not made or figures_alone or (by_branch and not promoted):
-        landing.set_aside(quarantined, lists)
+    if made and not figures_alone and (promoted or not by_branch):
+        night.commit = made
+    if night.commit and not by_branch:
+        tags = {f"refs/tags/production/{loop}/{night.run}": made for loop in promoted}
+        branch = landing.get_branch()
+        landing.land(Landing(made, branch, head, snapshot.files, tags, quarantined, lists), message)
+        night.notes += landing.finish()
         return
-    night.commit = made
-    if by_branch:
+    if night.commit:
         branch = f"refs/heads/{settings.branch}"
         landing.move({branch: (made, tips.get(branch, "0" * len(made)))}, message)
         night.notes.append(
             f"on branch {settings.branch} waits {night.run}: git merge {settings.branch} takes it over, and "
             "the night after puts it into production"
         )
-        landing.set_aside(quarantined, lists)
-        return
-    tags = {f"refs/tags/production/{loop}/{night.run}": made for loop in promoted}
-    landing.land(Landing(made, landing.get_branch(), head, snapshot.files, tags, quarantined, lists), message)
-    night.notes += landing.finish()
+    landing.set_aside(quarantined, lists)
 
 
 def _find_tips(settings: Nightly) -> dict[str, str]:

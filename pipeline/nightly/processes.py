@@ -11,8 +11,18 @@ from collections.abc import Mapping
 from pathlib import Path
 
 STATE = Path(".beadline")
-# in the environment of every child, so that the next night finds what a killed one left running
-TOKEN = "BEADLINE_NIGHT"
+# DVC for the night whose number its first argument is. If the night is killed, the kernel says so, if it can
+# (PR_SET_PDEATHSIG of prctl), and DVC ends with its stages, which are of its process group. The stages do not
+# hear of it themselves
+DVC = """
+import ctypes, os, runpy, signal, sys
+signal.signal(signal.SIGTERM, lambda *_: os.killpg(0, signal.SIGKILL))
+prctl = getattr(ctypes.CDLL(None), "prctl", None)
+prctl and prctl(1, signal.SIGTERM)
+if os.getppid() != int(sys.argv.pop(1)):
+    sys.exit("the night was killed before the kernel was asked")
+runpy.run_module("dvc", run_name="__main__", alter_sys=True)
+"""
 FULL_MB = 10.0  # a disk with less room is the likeliest cause of what failed
 FALLBACK = {"GIT_AUTHOR_NAME": "beadline nightly", "GIT_AUTHOR_EMAIL": "nightly@beadline.invalid"}
 
@@ -52,14 +62,6 @@ def names(
     return [name for name in git(command, "-z", *rest, env=env, place=place).split("\0") if name]
 
 
-def changed(*places: str, untracked: str = "no") -> list[str]:
-    """Paths below `places` (none: everywhere) that differ from the last commit; both names of one that was
-    renamed. `untracked` is git's word: no, normal or all."""
-    how = ("--porcelain", "--no-renames", f"--untracked-files={untracked}")
-    # two letters and a blank, either letter a blank too
-    return [entry[3:] for entry in names("status", *how, "--", *places)]
-
-
 def configure(settings: Mapping[str, str]) -> dict[str, str]:
     """The environment in which git goes by these settings, beside those that the environment has already."""
     before = int(os.environ.get("GIT_CONFIG_COUNT", "0") or 0)
@@ -75,25 +77,23 @@ def identity() -> dict[str, str]:
     return author | {key.replace("AUTHOR", "COMMITTER"): value for key, value in author.items()}
 
 
-def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> str:
-    """What `dvc ...` printed, run by this Python on the code of this folder. Raises ValueError with its own
-    sentence if it fails, and TooLongError if it takes longer than `limit_s`; its process group ends with
-    it."""
+def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> None:
+    """Runs `dvc ...` by this Python on the code of this folder; `log` is what it prints. Raises ValueError
+    with its own sentence if it fails, and TooLongError if it takes longer than `limit_s`; its process group
+    ends with it."""
     target = log or STATE / "dvc.log"
     target.parent.mkdir(parents=True, exist_ok=True)
-    env = os.environ | {
-        "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]),
-        "PYTHONPATH": os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")]),
-    }
+    first = {"PATH": str(Path(sys.executable).parent), "PYTHONPATH": str(Path.cwd())}
+    paths = {key: os.pathsep.join([path, os.environ.get(key, "")]) for key, path in first.items()}
     descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     try:
         child = subprocess.Popen(
-            [sys.executable, "-m", "dvc", *arguments],
+            [sys.executable, "-c", DVC, str(os.getpid()), *arguments],
             stdout=descriptor,
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
             start_new_session=True,
-            env=env,
+            env=os.environ | paths,
         )
     finally:
         os.close(descriptor)
@@ -107,13 +107,12 @@ def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> str:
         if child.poll() is None:
             os.killpg(child.pid, signal.SIGKILL)
             child.wait()
-    text = target.read_text(encoding="utf-8", errors="replace")
     if status:
         # on a full disk the log is cut off, and says nothing
         free_mb = shutil.disk_usage(Path()).free / 1e6
         full = f"; no space left on device ({free_mb:.1f} MB); free some" if free_mb < FULL_MB else ""
+        text = target.read_text(encoding="utf-8", errors="replace")
         raise ValueError(f"dvc {arguments[0]} failed: {find_sentence(text)}{full}")
-    return text
 
 
 def find_sentence(text: str) -> str:
@@ -128,42 +127,36 @@ def find_sentence(text: str) -> str:
     return reason if own or not before else f"{before[-1]} ({reason})"
 
 
-# ---- what a killed night left
-
-
-def end_orphans() -> int:
-    """Ends what a killed night left running, for it would write beside this one; call with the lock held.
-    How many there were; 0 if the system has no /proc."""
-    ended = 0
-    for entry in Path("/proc").glob("[0-9]*"):
-        pid = int(entry.name)
-        try:
-            environment = (entry / "environ").read_bytes()
-            if pid not in (os.getpid(), os.getppid()) and f"{TOKEN}={Path.cwd()}\0".encode() in environment:
-                os.kill(pid, signal.SIGKILL)
-                ended += 1
-        except OSError:
-            continue
-    return ended
-
-
 def remove_stale_locks() -> None:
-    """Removes what a killed DVC left half written, and lock files of git if no git is at work here."""
+    """Removes what a killed DVC left half written, and lock files of git if no git is at work here: an editor
+    may be open for hours over `git commit -a`, which holds its lock."""
     rwlock = Path(".dvc/tmp/rwlock")
     try:
         json.loads(rwlock.read_bytes() if rwlock.exists() else b"{}")
     except ValueError:  # half written: no later DVC would start
         rwlock.unlink(missing_ok=True)
-    if not Path("/proc/self").exists() or any(map(_works_here, Path("/proc").glob("[0-9]*"))):
-        return
     folder = Path(git("rev-parse", "--git-common-dir"))
-    for pattern in ("*.lock", "refs/heads/**/*.lock", "refs/tags/**/*.lock"):
-        for path in folder.glob(pattern):
+    locks = [
+        *folder.glob("*.lock"),
+        *folder.glob("refs/heads/**/*.lock"),
+        *folder.glob("refs/tags/**/*.lock"),
+    ]
+    if locks and not _git_works():
+        for path in locks:
             path.unlink(missing_ok=True)
 
 
-def _works_here(entry: Path) -> bool:
-    try:
-        return (entry / "comm").read_text().strip() == "git" and (entry / "cwd").resolve() == Path.cwd()
-    except OSError:
-        return False
+def _git_works() -> bool:
+    """Whether a git is at work in the project; True if the system cannot tell."""
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            if (entry / "comm").read_text().strip() != "git":
+                continue
+            folder = Path(os.readlink(entry / "cwd"))
+        except PermissionError:  # it is another user's
+            return True
+        except OSError:  # it has ended
+            continue
+        if Path.cwd() in (folder, *folder.parents):
+            return True
+    return not Path("/proc/self").exists()

@@ -1,15 +1,16 @@
 """Champion and challenger of each loop. A challenger that does not pass the rules of its page is a candidate,
-which nothing runs; one that passes goes in production where it is better than the champion, or there is none.
+which nothing runs; one that passes goes in production if it is better than the champion, or there is none.
+The verdict of each loop is that of the run, with the drift of tonight and with the controllers that are in
+production.
 """
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from pipeline.nightly import champion, judge, records, reporting, screening, verdicts
-from pipeline.nightly.decision import CaseCosts, decide
+from pipeline.nightly import champion, judge, records, reporting, screening
+from pipeline.nightly.decision import decide
+from pipeline.nightly.processes import dvc
 from pipeline.nightly.records import (
     CANDIDATE,
     KEPT,
@@ -19,11 +20,17 @@ from pipeline.nightly.records import (
     Night,
     candidate_of,
 )
+from pipeline.nightly.remembered import METRICS
 from pipeline.nightly.reproducing import read_stages
 from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.store import artifacts
+from pipeline.verdict import night as verdict_night
+from pipeline.verdict import verdict as verdicts
+from pipeline.verdict.files import read_evidence
 from pipeline.verdict.verdict import PASSED, Verdict
 
+STORED = "datasets/verdict"
+REPORT = "datasets/report/figures.json"
 # artifacts that only some contestants are designed from, and that a record may not determine
 OPTIONAL = {f"datasets/{path}" for path in judge.DESIGNED_FROM.values()}
 # the certified controller of the temperature loop, installed beside what it was designed from
@@ -32,33 +39,30 @@ CERTIFICATE = f"{EXPORTED}/certificate.json"
 CERTIFIED = (f"{EXPORTED}/controller.json", f"{EXPORTED}/arrays.safetensors", CERTIFICATE)
 
 
-# what was decided of a loop's challenger, and what the judge measured of it, if it was measured
-JudgedLoop = tuple[LoopDecision, Mapping[str, Any] | None]
-
-
 def judge_all(
     settings: Nightly, night: Night, state: ChampionState, lineage: Mapping[str, Any]
 ) -> ChampionState:
     """What is in production, and the candidates beside it; the night has a decision on each loop. Their files
     lie in champion/<loop> and champion/<loop>.candidate by then. Raises ValueError if no loop can be
     judged."""
-    by_loop = verdicts.read_verdicts(settings, night)
-    made_from = {**lineage, "dvc_lock": artifacts.sha256("dvc.lock")} if lineage else {}
+    by_loop = read_verdicts(settings, night)
     for name in settings.loops:
         verdict = by_loop.get(name)
         try:
-            decision, metrics = judge_loop(settings, name, night, state, verdict)
+            decision = judge_loop(settings, name, night, state, verdict)
         except reporting.REFUSALS as error:  # what cannot be judged stops no other loop
             why = " ".join(str(error).split())
             decision = LoopDecision(records.FAILED, [f"it cannot be judged, and its champion stays: {why}"])
-            metrics = None
         decision = decision._replace(verdict=verdict and verdict._replace(rules=()))
         night.decisions[name] = decision
         waits = decision.decision == CANDIDATE
         if decision.promotes or waits:
-            state = _place(settings, name, night, state, (decision, metrics), made_from)
+            state = _place(settings.loops[name], name, night, state, lineage)
         if name in state.candidates and not waits and verdict and verdict.state == PASSED:
-            state = _drop_candidate(state, name)
+            # what did not pass before it is of no more use
+            champion.remove(candidate_of(name))
+            others = {loop: one for loop, one in state.candidates.items() if loop != name}
+            state = state._replace(candidates=others)
     if night.lost == list(night.decisions):
         raise ValueError("; ".join(f"{name}: {one.reasons[0]}" for name, one in night.decisions.items()))
     outcome = records.PROMOTED if night.promoted else CANDIDATE if night.candidates else KEPT
@@ -67,44 +71,76 @@ def judge_all(
     return state
 
 
+# ---- the verdicts that the night obeys
+
+
+def read_verdicts(settings: Nightly, night: Night) -> dict[str, Verdict]:
+    """The verdict of each loop that has a page, as pages say it. A loop that is judged by a file of costs has
+    none: its rules are the guards of that file. If nightly.holdout.controller names a controller, the
+    temperature loop's verdict is about that one."""
+    loops = [name for name, loop in settings.loops.items() if loop.judge != "cases"]
+    if not loops:
+        return {}
+    evidence, stored, named = read_evidence(STORED), verdicts.read(STORED), settings.holdout.controller
+    tonight = artifacts.read_json(METRICS) if artifacts.exists(METRICS) else None
+    by_loop = verdict_night.verdicts(evidence, stored, tonight)
+    _make_pages_agree(by_loop, night)
+    if named != judge.PAGE:
+        by_loop = verdict_night.verdicts(evidence, stored, tonight, named=named)
+    if lacking := [name for name in loops if name not in by_loop]:
+        raise ValueError(
+            f"{STORED}/{lacking[0]}.json: expected the verdict of this run, found none; "
+            "run ./run dvc repro verdict, or switch the loop off in section loops"
+        )
+    return {name: by_loop[name] for name in loops}
+
+
+def _make_pages_agree(pages: Mapping[str, Verdict], night: Night) -> None:
+    """Makes the pages anew if they were made before drift or production changed, so that they say what the
+    night goes by."""
+    shown = (artifacts.read_json(REPORT).get("verdicts") or {}) if artifacts.exists(REPORT) else None
+    if shown is None or all(shown.get(loop) == verdict.metrics() for loop, verdict in pages.items()):
+        return
+    try:
+        dvc("repro", "--single-item", "--force", "report")
+    except ValueError as error:
+        night.notes.append(f"the pages are not of tonight ({error}); run ./run dvc repro --force report")
+
+
 # ---- one loop
 
 
 def judge_loop(
     settings: Nightly, name: str, night: Night, state: ChampionState, verdict: Verdict | None
-) -> JudgedLoop:
-    """What becomes of the challenger of one loop, with what it measured; `verdict` is None if the loop has no
-    page."""
-    loop, present = settings.loops[name], state.champions.get(name)
-    files = list_files(loop)
-    contestant = verdict.subject if verdict else _declared(settings, name)
+) -> LoopDecision:
+    """What becomes of the challenger of one loop; `verdict` is None if the loop has no page."""
+    loop, present, files = settings.loops[name], state.champions.get(name), list_files(settings.loops[name])
+    contestant = verdict.subject if verdict else ""
+    runs = (present.contestant if present else "") or contestant
     if lacking := champion.missing([path for path in loop.artifacts if path not in OPTIONAL]):
         return _keep(f"the challenger lacks {lacking[0]}; its stage did not write it")
     passes = verdict is None or verdict.state == PASSED
-    same = present is not None and champion.same(present.files, files)
-    if same and (not passes or runs(settings, name, present, contestant) == contestant):
+    if present and champion.same(present.files, files) and (runs == contestant or not passes):
         does_not = "" if passes else f", which does not pass: {verdict.sentence}"
         return _keep(f"the challenger is the champion, byte for byte{does_not}")
     if run := champion.find_rolled_back(state, name, files):
         return _keep(f"the challenger is that of {run}, which was rolled back by hand")
-    judging = judge.judge(loop, settings)
     why = find_missing_certificate(loop, contestant) if passes else verdict.sentence
     if verdict and why:
-        return _candidate(judging, verdict, state.candidates.get(name), files, why)
+        return LoopDecision(CANDIDATE, [why])
     own = f"datasets/{judge.DESIGNED_FROM[contestant]}" if contestant in judge.DESIGNED_FROM else ""
     if own and own not in loop.artifacts:
         return _keep(
             f"{contestant} is designed from {own}, which the champion would lack; add it to "
             f"nightly.loops.{name}.artifacts"
         )
+    judging = judge.judge(loop, settings)
     try:
         challenger = judging.measure(Path("datasets"), contestant)
-        before = None
-        if present:
-            before = judging.measure(champion.FOLDER / name, runs(settings, name, present, contestant))
+        before = judging.measure(champion.FOLDER / name, runs) if present else None
     except judge.NotComparable as reason:
         return _keep(f"champion and challenger cannot be compared: {reason}")
-    decision = decide(
+    return decide(
         before,
         challenger,
         settings.rule,
@@ -112,35 +148,15 @@ def judge_loop(
         alarms=[alarm for alarm in night.drift.alarms if alarm.loop == name],
         seed=night.number,
     )
-    return decision, _metrics(challenger)
+
+
+def _keep(reason: str) -> LoopDecision:
+    return LoopDecision(KEPT, [reason])
 
 
 def list_files(loop: NightlyLoop) -> list[str]:
     """The artifacts of a loop without the optional ones that its record did not determine."""
     return [path for path in loop.artifacts if path not in OPTIONAL or Path(path).is_file()]
-
-
-def runs(settings: Nightly, loop: str, present: Champion, contestant: str) -> str:
-    """The contestant that a champion runs as. A loop without a page has none: it is the declared one, or
-    the challenger's."""
-    return present.contestant or _declared(settings, loop) or contestant
-
-
-def _declared(settings: Nightly, loop: str) -> str:
-    return judge.declared(settings.holdout) if settings.loops[loop].judge == "temperature" else ""
-
-
-def _keep(reason: str) -> JudgedLoop:
-    return LoopDecision(KEPT, [reason]), None
-
-
-def _metrics(evidence: CaseCosts) -> dict[str, Any]:
-    mean_cost = float(np.mean([cost for _, cost in evidence.cases.values()]))
-    return {
-        "panel": evidence.panel,
-        "mean_cost": mean_cost if np.isfinite(mean_cost) else None,
-        "guards": {name: figure for name, figure in evidence.guards.items() if np.isfinite(figure)},
-    }
 
 
 def find_missing_certificate(loop: NightlyLoop, contestant: str) -> str:
@@ -165,58 +181,29 @@ def _asks_for_one(loop: NightlyLoop) -> bool:
     return loop.judge == "temperature" and CERTIFYING in read_stages("dvc.yaml")
 
 
-def _candidate(
-    judging: judge.Judge, verdict: Verdict, before: Champion | None, files: list[str], why: str
-) -> JudgedLoop:
-    """A challenger that the page's rules or its certificate keep out of production, and `why`, with what it
-    measures all the same."""
-    decision = LoopDecision(CANDIDATE, [why])
-    if before and before.contestant == verdict.subject and champion.same(before.files, files):
-        return decision, before.metrics
-    try:
-        evidence = judging.measure(Path("datasets"), verdict.subject)
-    except ValueError as reason:
-        return decision._replace(reasons=[why, f"not measured: {reason}"]), None
-    guards = {
-        name: {"champion": None, "challenger": figure, "allowed": None}
-        for name, figure in evidence.guards.items()
-    }
-    return decision._replace(guards=guards), _metrics(evidence)
-
-
 # ---- what lies in champion/
 
 
 def _place(
-    settings: Nightly,
-    name: str,
-    night: Night,
-    state: ChampionState,
-    judged: JudgedLoop,
-    lineage: Mapping[str, Any],
+    loop: NightlyLoop, name: str, night: Night, state: ChampionState, lineage: Mapping[str, Any]
 ) -> ChampionState:
     """The state with a challenger in production or as the candidate; its files lie in that folder then."""
-    decision, metrics = judged
-    loop, verdict, waits = settings.loops[name], decision.verdict, not decision.promotes
+    decision = night.decisions[name]
+    waits, verdict = not decision.promotes, decision.verdict
     files, why = list_files(loop), "; ".join(decision.reasons)
     before = state.candidates.get(name) if waits else None
     if before and champion.same(before.files, files):
-        one = before._replace(why=why, metrics=metrics)
+        one = before._replace(why=why)
     else:
         reference = None if waits else screening.reference(loop, Path("datasets"))
         beside = {screening.REFERENCE: reference} if reference else {}
         certified = [path for path in CERTIFIED if _asks_for_one(loop) and Path(path).is_file()]
         folder = candidate_of(name) if waits else name
-        pointer, md5s = champion.install(folder, [*files, *certified], beside)
-        one = Champion(night.run, night.when, why, pointer, md5s, metrics, lineage)
+        champion.remove(folder)
+        pointer, hashes = champion.hand_over(folder, [*files, *certified], beside)
+        one = Champion(night.run, night.when, why, pointer, hashes, lineage)
     if verdict:
         one = one._replace(contestant=verdict.subject, rehearsal=verdict.rehearsal, verdict=verdict.sentence)
     if waits:
         return state._replace(candidates={**state.candidates, name: one})
     return champion.promote(state, name, one, event=decision.decision)
-
-
-def _drop_candidate(state: ChampionState, name: str) -> ChampionState:
-    """The state after a challenger has passed: what did not pass before it is of no more use."""
-    champion.remove(candidate_of(name))
-    return state._replace(candidates={loop: one for loop, one in state.candidates.items() if loop != name})

@@ -100,10 +100,9 @@ class Champion(NamedTuple):
     """One loop's champion, or a candidate: the night that made it, when and why; what DVC's pointer says of
     its folder, and MD5 of its files by path. `since` is the time of a rollback to it.
 
-    `metrics` is what the judge measured: `panel`, `mean_cost` (None if a case fails), `guards`. `lineage` is
-    what it was made from: `commit` and what lay `uncommitted` on it, hashes of `dvc_lock`, `params` and
-    `recordings`. `contestant` is the controller that runs, by its name on the pages. `rehearsal`: it was
-    judged on simulated data alone. `verdict` is what the page said of it then.
+    `lineage`: the `commit` that the night worked from, and what lay `uncommitted` on it. `contestant` is the
+    controller that runs, by its name on the pages. `rehearsal`: it was judged on simulated data alone.
+    `verdict` is what the page said of it then.
     """
 
     run: str
@@ -111,7 +110,6 @@ class Champion(NamedTuple):
     why: str = ""
     folder: Mapping[str, Any] = {}
     files: Mapping[str, str] = {}
-    metrics: Mapping[str, Any] | None = None
     lineage: Mapping[str, Any] = {}
     since: str = ""
     contestant: str = ""

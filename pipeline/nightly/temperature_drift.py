@@ -1,7 +1,6 @@
 """The temperature loop's part of a night: new recordings held against those of the champion. A record that is
 not what it says is set aside, and what it says of the machine, put right, counts all the same."""
 
-import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,13 +10,13 @@ import numpy as np
 from pipeline.nightly import baseline, drift, judge, mistakes, pictures, sensors
 from pipeline.nightly.baseline import Baseline
 from pipeline.nightly.camera_drift import CameraChange
-from pipeline.nightly.drift import CauseFit, DriftCause, DriftRecord, Explanation, ProductionModel, Segments
+from pipeline.nightly.drift import CauseFit, DriftRecord, Explanation, ProductionModel, Segments
 from pipeline.nightly.inputs import quarantine
 from pipeline.nightly.records import SENSOR, Alarm, Memory, NightDrift
 from pipeline.nightly.settings import DriftLimits, NightlyLoop
 from pipeline.store import artifacts, params
 from pipeline.temperature.identification import model_choice
-from pipeline.temperature.settings import Plant, PlantSignal, recorded
+from pipeline.temperature.settings import Plant, recorded
 from pipeline.temperature.tables import set_point_of
 
 REFERENCE = "reference.json"  # in the champion's folder
@@ -43,19 +42,43 @@ SHORTEST = 60  # samples of a stretch at one set-point that can settle
 PARTS = 4  # of a record, whose scatter tells how well its closed-loop figures are known
 
 
+# by kind of cause: its limit in nightly.drift, and what is said of it; `size` is in the unit of the limit
+SENTENCES = {
+    "gain": ("parameter_percent", "the gain from {name} has changed by {size:+.1f} %"),
+    "time constant": (
+        "time_constant_percent",
+        "the time constants of what answers to {name} have changed by {size:+.1f} %",
+    ),
+    "saturation": (
+        "at_limits_points",
+        "{name} no longer gives more than {value:.0f} %: more was asked of it in {size:.0f} % of the record",
+    ),
+    "offset": (
+        "offset_degC",
+        "{name} reads {size:+.1f} °C from what it did: its offset, or the heat lost there, has changed",
+    ),
+    "delay": ("delay_s", "{name} acts {late} than it did{clock}"),
+    "late sensor": ("delay_s", "{name} reads {late} than it did{clock}"),
+}
+
+
 class ProductionReference(NamedTuple):
     """What the champion's own recordings said of its model, and their closed-loop figures; `steps` (p,) are
     those of the sensors in °C. `digest` is that of reference.json, by which the memory of the nights knows it
-    again. Then the names of the machine's signals, and the limits that changes are held against."""
+    again. Then the machine as it is declared, and the limits that changes are held against."""
 
     machine: ProductionModel
     own: Baseline
     loop: list[dict[str, list[list[float]]]]
     steps: np.ndarray
     digest: str
-    inputs: list[str]
-    outputs: list[str]
+    plant: Plant
     limits: DriftLimits
+
+    @property
+    def signals(self) -> dict[str, list[str]]:
+        """Names of inputs and outputs."""
+        return {side: [one.name for one in getattr(self.plant, side)] for side in ("inputs", "outputs")}
 
 
 class RecordingChange(NamedTuple):
@@ -86,38 +109,32 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
     named = [path.removeprefix(f"{loop.recordings}/") for path in only] or sorted(records)
     kept = [records[path].record for path in named if path in records]
     kept = [one for one in kept if judge.segments(one, machine)][-NIGHTS:]
+    floors = NIGHTS_FLOORS
+    if len(kept) == 1:
+        parts = {name: np.array_split(column[-LONGEST:], PIECES) for name, column in kept[0].items()}
+        pieces = [{name: columns[k] for name, columns in parts.items()} for k in range(PIECES)]
+        kept = [one for one in pieces if judge.segments(one, machine)]
+        floors = PIECES_FLOORS
     nights = [_last(judge.segments(one, machine)) for one in kept]
-    floors = NIGHTS_FLOORS if len(nights) > 1 else PIECES_FLOORS
-    if len(nights) == 1:
-        nights = [
-            [(part, other)]
-            for u, y in nights[0]
-            for part, other in zip(np.array_split(u, PIECES), np.array_split(y, PIECES), strict=True)
-        ]
-        kept = _cut(kept[0])
+    samples = int(np.median([sum(len(u) for u, _ in night) for night in nights])) if nights else 0
     try:
-        production = ProductionModel(judge.identified(folder), _samples(nights))
+        production = ProductionModel(judge.identified(folder), samples)
         # of recordings that are named, the champion's model is not made
-        own = baseline.measured(production, nights, floors, None if only else _without_each(machine, nights))
+        without = None if only else _without_each(machine, nights, samples)
+        own = baseline.measured(production, nights, floors, without)
     except ValueError:
         return None
     return {
         "schema": "reference",
         "version": baseline.VERSION,
-        "samples": _samples(nights),
+        "samples": samples,
         "own": own.to_json(),
         "loop": [_closed_loop(one, machine) for one in kept],
         "steps": sensors.steps(nights).tolist(),
     }
 
 
-def _cut(record: Mapping[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
-    """The record's last LONGEST samples in PIECES."""
-    parts = {name: np.array_split(column[-LONGEST:], PIECES) for name, column in record.items()}
-    return [{name: columns[k] for name, columns in parts.items()} for k in range(PIECES)]
-
-
-def _without_each(machine: Plant, nights: Sequence[Segments]) -> list[ProductionModel]:
+def _without_each(machine: Plant, nights: Sequence[Segments], samples: int) -> list[ProductionModel]:
     """For each night a model that was identified without it, as a new night's is: what such a model gets
     wrong of it is no change of the machine. Nights share FOLDS models. Raises ValueError where the others do
     not determine one."""
@@ -126,12 +143,12 @@ def _without_each(machine: Plant, nights: Sequence[Segments]) -> list[Production
     names, folds = [signal.name for signal in machine.inputs], min(FOLDS, len(nights))
     models = []
     for fold in range(folds):
-        others = [pair for k, night in enumerate(nights) if k % folds != fold for pair in night]
-        u, y = [pair[0] for pair in others], [pair[1] for pair in others]
+        pairs = [pair for k, night in enumerate(nights) if k % folds != fold for pair in night]
+        u, y = ([pair[side] for pair in pairs] for side in (0, 1))
         model = model_choice.identify(
             u, y, sample_time_s=machine.sample_time_s, settings=settings, names=names
         )
-        models.append(ProductionModel(model.plant, _samples(nights)))
+        models.append(ProductionModel(model.plant, samples))
     return [models[k % folds] for k in range(len(nights))]
 
 
@@ -139,34 +156,28 @@ def read_reference(folder: Path, machine: Plant, limits: DriftLimits) -> Product
     """That of a champion's folder; None if it has none that this version reads."""
     path = folder / REFERENCE
     fields = artifacts.read_json(path) if path.exists() else {}
-    if fields.get("version") != baseline.VERSION:
+    if fields.get("version") not in (baseline.BEFORE, baseline.VERSION):
         return None
+    own = fields["own"] if fields["version"] == baseline.VERSION else baseline.rewrite(fields["own"])
     model = ProductionModel(judge.identified(folder), fields["samples"])
     return ProductionReference(
         model,
-        Baseline.read(fields["own"]),
+        Baseline.read(own),
         fields["loop"],
         np.array(fields.get("steps", [np.inf] * model.plant.p)),
         artifacts.sha256(path),
-        [signal.name for signal in machine.inputs],
-        [signal.name for signal in machine.outputs],
+        machine,
         limits,
     )
 
 
 def _last(segments: Segments) -> Segments:
     """The last LONGEST samples of a record: they tell enough, and a night has other things to do."""
-    kept, left = [], LONGEST
-    for u, y in reversed(segments):
-        if left > 0:
-            kept.append((u[-left:], y[-left:]))
-            left -= len(u)
-    return kept[::-1]
-
-
-def _samples(nights: Sequence[Segments]) -> int:
-    """Of a typical night."""
-    return int(np.median([sum(len(u) for u, _ in night) for night in nights]))
+    ends = np.cumsum([len(u) for u, _ in segments])
+    skips = [
+        max(int(ends[-1] - LONGEST - (end - len(u))), 0) for end, (u, _) in zip(ends, segments, strict=True)
+    ]
+    return [(u[skip:], y[skip:]) for skip, (u, y) in zip(skips, segments, strict=True) if skip < len(u)]
 
 
 # ---- a night's recordings
@@ -189,16 +200,14 @@ def look(
         return recent
     machine, broken = recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet"), {}
     records = judge.read_records(Path(folder), machine, broken)
-    good = {}
-    for path in new:
-        within = path.removeprefix(f"{folder}/")
-        if within in broken:
-            for output in machine.outputs:
-                if f"should hold numbers for {output.name} but all of its" in broken[within]:
-                    _doubt(findings, loop, path, output.name, f"{output.name} gives no number.")
-            findings.quarantined[path] = quarantine(path, loop, broken[within])
-        elif within in records:
-            good[path] = records[within].record
+    within = {path: path.removeprefix(f"{folder}/") for path in new}
+    for path in (path for path in new if within[path] in broken):
+        reason = broken[within[path]]
+        for output in machine.outputs:
+            if f"should hold numbers for {output.name} but all of its" in reason:
+                _doubt(findings, loop, path, output.name, f"{output.name} gives no number.")
+        findings.quarantined[path] = quarantine(path, loop, reason)
+    good = {path: records[within[path]].record for path in new if within[path] in records}
     if champion is None or not good:
         return recent
     production = read_reference(champion, machine, limits)
@@ -211,37 +220,33 @@ def look(
     nights = list(recent["nights"]) if recent.get("reference") == production.digest else []
     for path, record in good.items():
         try:
-            if not _stand_still(findings, loop, path, record, production, machine):
-                _hold_against(findings, loop, path, record, production, machine, nights, memory.pending)
+            if not _stand_still(findings, loop, path, record, production):
+                _hold_against(findings, loop, path, record, production, nights, memory.pending)
         except ValueError as error:
             findings.notes.append(f"{path}: {error}")
     return {"reference": production.digest, "nights": nights}
 
 
 def _stand_still(
-    findings: NightDrift,
-    loop: str,
-    path: str,
-    record: dict[str, np.ndarray],
-    production: ProductionReference,
-    machine: Plant,
+    findings: NightDrift, loop: str, path: str, record: dict[str, np.ndarray], production: ProductionReference
 ) -> bool:
     """Whether a sensor gives no number or stands still in a recording: then that is an alarm, the recording
     is set aside, and nothing else is asked of it. Readings in °F or K are out of limits as well: if they are
     within them with that undone, and fit the model, it is a mistake of the record and no alarm."""
-    readings = _last(judge.segments(record, machine, masked=False))
+    readings = _last(judge.segments(record, production.plant, masked=False))
     noise = np.exp(production.own.noise.mean(axis=0) / 2)
-    plant, steps = production.machine.plant, production.steps
-    faults = sensors.faults(plant, machine, readings, noise=noise, steps=steps)
+
+    def find_faults(segments: Segments) -> list[sensors.SensorFault]:
+        model = production.machine.plant
+        return sensors.faults(model, production.plant, segments, noise=noise, steps=production.steps)
+
+    faults = find_faults(readings)
     if not faults:
         return False
     reason = f"{faults[0].sentence} It says nothing of the machine"
     if all(fault.kind == sensors.OPEN for fault in faults):
-        mistake = mistakes.likeliest(
-            production.machine, readings, production.own, inputs=production.inputs, outputs=production.outputs
-        )
-        fits = mistake.left <= mistakes.honest(production.own)
-        if fits and not sensors.faults(plant, machine, mistake.undone, noise=noise, steps=steps):
+        mistake = mistakes.likeliest(production.machine, readings, production.own, **production.signals)
+        if mistake.left <= mistakes.honest(production.own) and not find_faults(mistake.undone):
             reason = f"{mistake.words}: undone, the readings are within their limits; mend it and put it back"
             faults = []
     for fault in faults:
@@ -261,17 +266,15 @@ def _hold_against(
     path: str,
     record: dict[str, np.ndarray],
     production: ProductionReference,
-    machine: Plant,
     nights: list[dict[str, list[float]]],
     pending: Sequence[str],
 ) -> None:
     """Adds what one recording says of the machine to the findings; its changes join those of `nights`."""
+    machine, limits = production.plant, production.limits
     segments, closed_loop = _last(judge.segments(record, machine)), _closed_loop(record, machine)
     if not segments:
         return
-    mistake = mistakes.found(
-        production.machine, segments, production.own, inputs=production.inputs, outputs=production.outputs
-    )
+    mistake = mistakes.found(production.machine, segments, production.own, **production.signals)
     if mistake:
         findings.quarantined[path] = quarantine(path, loop, f"{path}: {mistake.reason}")
         segments, closed_loop = mistake.undone, {}
@@ -289,33 +292,30 @@ def _hold_against(
     findings.notes.append(f"{Path(path).name} would have shown {measured.figures['least']}")
     nights.append({one.key: [round(one.size, 6), round(one.deviation, 6)] for one in changes})
     del nights[:-POOLED]
-    consequences, quiet = tuple(cause.words for cause in measured.loop), True
-    for change in changes:
-        sure = past_limit([night.get(change.key) for night in nights], change.limit)
-        if abs(change.size) >= change.limit or sure >= production.limits.limit_sigmas:
-            sigmas = float(np.clip(change.size / max(change.deviation, 1e-9), -999.0, 999.0))
-            alarm = Alarm(
-                loop, f"{loop}: {change.key}", path, change.words, round(sigmas, 1), consequences,
-                change.kind, change.channel,
-            )  # fmt: skip
-            (findings.alarms if sure >= production.limits.limit_sigmas else findings.watched).append(alarm)
-            quiet = False
-    if quiet:
-        pictures.add_alarms(findings, production.limits, loop, path, measured.loop, pending)
+    pooled = {one: past_limit([night.get(one.key) for night in nights], one.limit) for one in changes}
+    said = [one for one in changes if abs(one.size) >= one.limit or pooled[one] >= limits.limit_sigmas]
+    consequences = tuple(cause.words for cause in measured.loop)
+    for one in said:
+        sigmas = round(float(np.clip(one.size / max(one.deviation, 1e-9), -999.0, 999.0)), 1)
+        alarm = Alarm(
+            loop, f"{loop}: {one.key}", path, one.words, sigmas, consequences, one.kind, one.channel
+        )
+        (findings.alarms if pooled[one] >= limits.limit_sigmas else findings.watched).append(alarm)
+    if not said:
+        pictures.add_alarms(findings, limits, loop, path, measured.loop, pending)
 
 
 def past_limit(estimates: Sequence[Sequence[float] | None], limit: float) -> float:
     """How surely a change is past its limit, in sigmas: the largest of the last nights' evidence together, of
     the last one, the last two, and so on while they agree in sign (Page's test; Page 1954). `estimates` are
     [size, standard deviation] of each night, None if it named nothing."""
-    largest, total, sign = -np.inf, 0.0, 0.0
-    for k, estimate in enumerate(reversed(estimates), 1):
-        if estimate is None or sign * estimate[0] < 0:
+    agreeing: list[Sequence[float]] = []
+    for estimate in reversed(estimates):
+        if estimate is None or (agreeing and estimate[0] * agreeing[0][0] < 0):
             break
-        sign = np.sign(estimate[0])
-        total += (abs(estimate[0]) - limit) / max(estimate[1], 1e-9)
-        largest = max(largest, total / np.sqrt(k))
-    return float(largest)
+        agreeing.append(estimate)
+    evidence = np.cumsum([(abs(size) - limit) / max(deviation, 1e-9) for size, deviation in agreeing])
+    return float(np.max(evidence / np.sqrt(np.arange(1, len(evidence) + 1)), initial=-np.inf))
 
 
 # ---- one recording
@@ -349,24 +349,21 @@ def _measure(
     ]
     air = drift.levels(record, explained.changes)[0]
     if abs(air) > production.limits.ambient_degC:
-        changes.append(_say_air(production, air, record))
+        changes.append(_say_air(production, air))
     effect = drift.moved(record, own.changes, explained.changes) + abs(air)
     figures, loop, not_applicable = _compare_loop(closed_loop, production, effect, unchanged=not changes)
     innovation, louder = _compare_noise(record, explained, production)
     fits = [*explained.others, *(named.fit for named in explained.named)]
     samples = sum(int(one.measured.sum()) for one in record.segments)
-    return RecordingDrift(
-        {
-            "parameters": _tell_parameters(fits, production),
-            "innovation": innovation,
-            "closed_loop": figures,
-            "not_applicable": not_applicable,
-            "least": _tell_least(fits, production),
-        },
-        [*changes, *louder],
-        loop,
-        float(explained.left @ explained.left) / max(samples, 1),
-    )
+    shown = {
+        "parameters": _tell_parameters(fits, production),
+        "innovation": innovation,
+        "closed_loop": figures,
+        "not_applicable": not_applicable,
+        "least": _tell_least(fits, production),
+    }
+    misfit = float(explained.left @ explained.left) / max(samples, 1)
+    return RecordingDrift(shown, [*changes, *louder], loop, misfit)
 
 
 def _find_doubt(
@@ -379,9 +376,7 @@ def _find_doubt(
     unexplained = measured.misfit > UNEXPLAINED * mistakes.honest(production.own)
     if not impossible and not unexplained and len(measured.changes) < drift.MOST:
         return None
-    likeliest = mistakes.likeliest(
-        production.machine, segments, production.own, inputs=production.inputs, outputs=production.outputs
-    )
+    likeliest = mistakes.likeliest(production.machine, segments, production.own, **production.signals)
     words = "this record does not fit the machine"
     if likeliest.better >= WORTH_NAMING:
         words += (
@@ -400,79 +395,65 @@ def cannot_be(kind: str, size: float) -> bool:
     return abs(size) > {"gain": MOST_GAIN_PERCENT, "offset": MOST_OFFSET_DEGC}.get(kind, np.inf)
 
 
-def _name(cause: DriftCause, production: ProductionReference) -> str:
-    of = production.outputs if cause.kind in ("offset", "late sensor") else production.inputs
-    return of[cause.channel] if cause.channel >= 0 else "every input"
+def _name(fit: CauseFit, production: ProductionReference) -> str:
+    signals = (
+        production.plant.outputs if fit.cause.kind in ("offset", "late sensor") else production.plant.inputs
+    )
+    return signals[fit.cause.channel].name if fit.cause.channel >= 0 else "every input"
+
+
+def _limit(fit: CauseFit, production: ProductionReference) -> float:
+    return getattr(production.limits, SENTENCES[fit.cause.kind][0])
 
 
 def _size(fit: CauseFit, production: ProductionReference, segments: Segments = ()) -> tuple[float, float]:
     """A fit and its standard deviation in the unit of its limit: percent, s, °C, or percent of the record."""
     cause, value, deviation = fit.cause, fit.value, fit.deviation
     if cause.kind == "saturation":
-        least, most = (drift.above(segments, cause.channel, value + side * deviation) for side in (1, -1))
-        return drift.above(segments, cause.channel, value), max((most - least) / 2, 0.5)
-    at = drift.causes(production.machine.plant).index(cause)
+        least, at, most = (drift.above(segments, cause.channel, value + k * deviation) for k in (1, 0, -1))
+        return at, max((most - least) / 2, 0.5)
+    own, of = production.own, [drift.causes(production.machine.plant).index(cause)]
     among = drift.shift(
-        np.array([value]), np.array([deviation]),
-        production.own.values[:, [at]], production.own.deviations[:, [at]], nights=len(production.own.noise),
+        np.array([value]), np.array([deviation]), own.values[:, of], own.deviations[:, of],
+        nights=len(own.noise),
     )  # fmt: skip
-    moved, deviation = float(among.value[0] - among.reference[0]), float(among.deviation[0])
-    if cause.kind == "gain":
-        return 100 * moved, 100 * deviation
+    change, deviation = float(among.value[0] - among.reference[0]), float(among.deviation[0])
     if cause.kind == "time constant":
-        longer = 1 / (1 + max(moved, -0.9))
+        longer = 1 / (1 + max(change, -0.9))
         return 100 * (longer - 1), 100 * deviation * longer**2
-    step = production.machine.plant.sample_time_s if cause.kind in ("delay", "late sensor") else 1.0
-    return moved * step, deviation * step
-
-
-def _limit(limits: DriftLimits, cause: DriftCause) -> float:
-    return {
-        "gain": limits.parameter_percent, "time constant": limits.time_constant_percent,
-        "delay": limits.delay_s, "late sensor": limits.delay_s, "offset": limits.offset_degC,
-        "saturation": limits.at_limits_points,
-    }[cause.kind]  # fmt: skip
+    unit = {"gain": 100.0, "offset": 1.0}.get(cause.kind, production.plant.sample_time_s)
+    return change * unit, deviation * unit
 
 
 def _say(production: ProductionReference, fit: CauseFit, segments: Segments) -> RecordingChange:
-    cause, name = fit.cause, _name(fit.cause, production)
+    kind, name = fit.cause.kind, _name(fit, production)
     size, deviation = _size(fit, production, segments)
-    verb, when = ("reads" if cause.kind == "late sensor" else "acts"), ("later" if size > 0 else "earlier")
-    clock = ", or the clock of the outputs is off against that of the inputs" if cause.channel < 0 else ""
-    late = f"{name} {verb} {abs(size):.1f} s {when} than it did{clock}"
-    words = {
-        "gain": f"the gain from {name} has changed by {size:+.1f} %",
-        "time constant": f"the time constants of what answers to {name} have changed by {size:+.1f} %",
-        "saturation": f"{name} no longer gives more than {fit.value:.0f} %: more was asked of it in "
-        f"{size:.0f} % of the record",
-        "offset": f"{name} reads {size:+.1f} °C from what it did: its offset, or the heat lost there, has "
-        "changed",
-        "delay": late,
-        "late sensor": late,
-    }[cause.kind]
-    kind = "delay" if cause.kind == "late sensor" else cause.kind
-    return RecordingChange(kind, name, words, size, deviation, _limit(production.limits, cause))
+    late = f"{abs(size):.1f} s {'later' if size > 0 else 'earlier'}"
+    every = fit.cause.channel < 0
+    clock = ", or the clock of the outputs is off against that of the inputs" if every else ""
+    words = SENTENCES[kind][1].format(name=name, size=size, value=fit.value, late=late, clock=clock)
+    kind = "delay" if kind == "late sensor" else kind
+    return RecordingChange(kind, name, words, size, deviation, _limit(fit, production))
 
 
 def _join_rivals(rivals: Sequence[RecordingChange]) -> RecordingChange:
     """Rivals, the likeliest first, as one: if one of them is far past its own limit and the likeliest is not,
     it is said first."""
-    past = [abs(one.size) / one.limit for one in rivals]
-    at = int(np.argmax(past))
-    first = rivals[at] if past[at] >= AHEAD and past[0] < 1 else rivals[0]
-    rivals = [first, *(one for one in rivals if one is not first)]
+    farthest = max(rivals, key=lambda one: abs(one.size) / one.limit)
+    ahead = abs(farthest.size) >= AHEAD * farthest.limit and abs(rivals[0].size) < rivals[0].limit
+    rivals = sorted(rivals, key=lambda one: ahead and one is not farthest)
     rest = ": this record cannot tell which" if len(rivals) > 1 else ""
     kinds = dict.fromkeys(one.kind for one in rivals)
-    return first._replace(kind=" or ".join(kinds), words=", or ".join(one.words for one in rivals) + rest)
+    words = ", or ".join(one.words for one in rivals) + rest
+    return rivals[0]._replace(kind=" or ".join(kinds), words=words)
 
 
-def _say_air(production: ProductionReference, air: float, record: DriftRecord) -> RecordingChange:
-    word = "warmer" if air > 0 else "colder"
+def _say_air(production: ProductionReference, air: float) -> RecordingChange:
     words = (
-        f"it is {abs(air):.0f} °C {word} around the machine than on the champion's own nights, or every "
-        "sensor reads so much from what it did"
+        f"it is {abs(air):.0f} °C {'warmer' if air > 0 else 'colder'} around the machine than on the "
+        "champion's own nights, or every sensor reads so much from what it did"
     )
-    deviation = float(np.hypot(drift.air_deviation(record), production.own.scale.ambient))
+    deviation = float(production.own.scale.ambient)
     return RecordingChange("ambient", "", words, air, deviation, production.limits.ambient_degC)
 
 
@@ -487,7 +468,7 @@ def _compare_noise(
     known = np.hypot(production.own.scale.ambient, production.own.scale.level)
     ratio, limit = np.exp(0.5 * (noise.value - noise.reference)), production.limits.noise_percent
     figures, louder = {}, []
-    for i, output in enumerate(production.outputs):
+    for i, output in enumerate(production.signals["outputs"]):
         percent, sigmas, level = 100 * float(ratio[i] - 1), float(noise.sigmas[i]), float(air + own[i])
         figures[output] = {
             "noise_percent": percent, "noise_sigmas": sigmas,
@@ -507,11 +488,12 @@ def _tell_parameters(
 ) -> dict[str, dict[str, float]]:
     """{cause: change in percent, half of its 90 % band, sigmas} of gains and time constants: what was named,
     and what the others seem beside it."""
-    fit_of, figures = {fit.cause: fit for fit in fits}, {}
-    for cause in drift.causes(production.machine.plant):
-        if cause.kind in ("gain", "time constant"):
-            percent, deviation = _size(fit_of[cause], production)
-            name = f"{cause.kind} from {_name(cause, production).replace('every input', 'all inputs')}"
+    figures = {}
+    order = drift.causes(production.machine.plant)
+    for fit in sorted(fits, key=lambda fit: order.index(fit.cause)):
+        if fit.cause.kind in ("gain", "time constant"):
+            percent, deviation = _size(fit, production)
+            name = f"{fit.cause.kind} from {_name(fit, production).replace('every input', 'all inputs')}"
             sigmas = percent / max(deviation, 1e-9)
             figures[name] = {"percent": percent, "band_percent": 1.645 * deviation, "sigmas": sigmas}
     return figures
@@ -522,14 +504,15 @@ def _tell_least(fits: Sequence[CauseFit], production: ProductionReference) -> st
     that is known least."""
     words = []
     for article, kind, unit in (("a", "gain", "%"), ("an", "offset", "°C")):
-        sizes = {
-            _name(fit.cause, production): _limit(production.limits, fit.cause)
-            + production.limits.limit_sigmas * _size(fit, production)[1]
+        size, name = max(
+            (
+                _limit(fit, production) + production.limits.limit_sigmas * _size(fit, production)[1],
+                _name(fit, production),
+            )
             for fit in fits
             if fit.cause.kind == kind and fit.cause.channel >= 0
-        }
-        worst = max(sizes, key=sizes.__getitem__)
-        words.append(f"{article} {kind} of {worst} from {sizes[worst]:.1f} {unit} on")
+        )
+        words.append(f"{article} {kind} of {name} from {size:.1f} {unit} on")
     return " and ".join(words)
 
 
@@ -541,43 +524,38 @@ def _closed_loop(record: Mapping[str, np.ndarray], machine: Plant) -> dict[str, 
     its share of samples at a limit, both in percent, and the settled set-points in °C: [figures, their
     standard deviations], from PARTS of the record, which are longer than what a loop remembers. Empty where
     nothing is settled."""
-    u, y = (_last_of(record, signals) for signals in (machine.inputs, machine.outputs))
-    wanted = np.column_stack(
-        [
-            record.get(set_point_of(o.name), np.full(len(record["time_s"]), o.reference))[-LONGEST:]
-            for o in machine.outputs
-        ]
-    )
+    u, y = np.split(
+        np.column_stack([
+            np.where(record[f"{s.name}_masked"], np.nan, record[s.name]).astype(float)
+            for s in (*machine.inputs, *machine.outputs)
+        ])[-LONGEST:],
+        [len(machine.inputs)],
+        axis=1,
+    )  # fmt: skip
+    samples = len(record["time_s"])
+    targets = [record.get(set_point_of(o.name), np.full(samples, o.reference)) for o in machine.outputs]
+    wanted = np.column_stack(targets)[-LONGEST:]
     settled = _settled(wanted)
     if settled.sum() < PARTS * SHORTEST:
         return {}
     low, high = np.array([(i.low, i.high) for i in machine.inputs]).T
-    limited = 100.0 * ((u <= low + 1e-9) | (u >= high - 1e-9))
     mean_square, deviation = np.array(_mean(u**2))
     effort = np.sqrt(mean_square)
     return {
         "offset_degC": _mean((y - wanted)[settled]),
         "effort_percent": [effort.tolist(), (deviation / np.maximum(2 * effort, 1e-9)).tolist()],
-        "at_limits_percent": _mean(limited),
+        "at_limits_percent": _mean(100.0 * ((u <= low + 1e-9) | (u >= high - 1e-9))),
         "set_point_degC": [wanted[settled].mean(axis=0).tolist(), [0.0] * len(machine.outputs)],
     }
-
-
-def _last_of(record: Mapping[str, np.ndarray], signals: Sequence[PlantSignal]) -> np.ndarray:
-    """(T, k) of the last LONGEST samples; NaN where one is masked."""
-    columns = [np.where(record[f"{s.name}_masked"], np.nan, record[s.name]) for s in signals]
-    return np.column_stack(columns)[-LONGEST:].astype(float)
 
 
 def _settled(wanted: np.ndarray) -> np.ndarray:
     """Where (T,) a loop has had time to reach its set-points (T, p): the last two thirds of a stretch of
     SHORTEST samples or more in which none is changed. No set-point, or 0, is a heater that is off."""
     changes = np.flatnonzero((np.diff(wanted, axis=0) != 0).any(axis=1)) + 1
-    edges = [0, *changes.tolist(), len(wanted)]
-    settled = np.zeros(len(wanted), bool)
-    for begin, end in itertools.pairwise(edges):
-        if end - begin >= SHORTEST:
-            settled[begin + (end - begin) // 3 : end] = True
+    stretches = np.split(np.arange(len(wanted)), changes)
+    late = [one[len(one) // 3 :] for one in stretches if len(one) >= SHORTEST]
+    settled = np.isin(np.arange(len(wanted)), np.concatenate([[], *late]))
     return settled & (wanted > 0).all(axis=1)
 
 
@@ -585,10 +563,8 @@ def _mean(values: np.ndarray) -> list[list[float]]:
     """Mean (k,) of values (T, k) that are there, and its standard deviation from the means of PARTS."""
     parts = np.ma.masked_invalid(values)
     means = np.ma.stack([part.mean(axis=0) for part in np.array_split(parts, PARTS)])
-    return [
-        parts.mean(axis=0).filled(0.0).tolist(),
-        (means.std(axis=0, ddof=1) / np.sqrt(PARTS)).filled(0.0).tolist(),
-    ]
+    deviation = means.std(axis=0, ddof=1) / np.sqrt(PARTS)
+    return [one.filled(0.0).tolist() for one in (parts.mean(axis=0), deviation)]
 
 
 def _compare_loop(
@@ -629,7 +605,7 @@ def _compare_loop(
         if elsewhere and key != "offset_degC":  # other set-points take other duties
             continue
         moved = _shift_loop(now[key], usual[key], least)
-        for k, name in enumerate(production.outputs if key == "offset_degC" else production.inputs):
+        for k, name in enumerate(production.signals["outputs" if key == "offset_degC" else "inputs"]):
             by, sigmas = float(moved.value[k] - moved.reference[k]), float(moved.sigmas[k])
             figures[f"{name} {key}"] = {"moved": by, "sigmas": sigmas}
             beyond = abs(by) - least - (allowed[k] if unchanged else 0.0)

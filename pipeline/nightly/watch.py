@@ -140,33 +140,32 @@ def beat(routes: Routes) -> list[str]:
 
 
 def _command(command: str, kind: str, alarm: bytes) -> str:
-    """Why the command did not do its work, empty where it did. It reads the alarm from its input too, which
+    """Why the command did not do its work, empty if it did. It reads the alarm from its input too, which
     needs no file."""
-    with tempfile.TemporaryFile() as said:
+    with tempfile.TemporaryFile() as printed:
         try:
             child = subprocess.Popen(
                 [*shlex.split(command), str(ALARM)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
-                stderr=said,
+                stderr=printed,
                 start_new_session=True,
                 env={**os.environ, "BEADLINE_ALARM_KIND": kind},
             )
+            child.communicate(alarm, COMMAND_S)
         except (OSError, ValueError) as error:
             return f"could not be started: {getattr(error, 'strerror', None) or error}"
-        try:
-            child.communicate(alarm, COMMAND_S)
         except subprocess.TimeoutExpired:
             os.killpg(child.pid, signal.SIGKILL)
             child.wait()
             return f"was ended after {COMMAND_S:g} s"
-        said.seek(0)
-        words = " ".join(said.read().decode(errors="replace").split())[-200:]
+        printed.seek(0)
+        words = " ".join(printed.read().decode(errors="replace").split())[-200:]
     return f"ended with status {child.returncode}: {words}" if child.returncode else ""
 
 
 def _ask(url: str, body: bytes | None = None) -> str:
-    """Asks a server, once more after a pause where it fails; why it failed, empty where it did not."""
+    """Asks a server, once more after a pause if it fails; why it failed, empty if it did not."""
     if not (trouble := _try(url, body)):
         return ""
     time.sleep(PAUSE_S)
@@ -174,20 +173,19 @@ def _ask(url: str, body: bytes | None = None) -> str:
 
 
 def _try(url: str, body: bytes | None) -> str:
-    """One try, within ASKED_S: in a thread, for a server's name or its headers byte by byte
-    take as long as they like."""
+    """One try, within ASKED_S: in a thread, for a server's name or its headers byte by byte take as long as
+    they like."""
     troubles = [f"no answer within {ASKED_S:g} s"]
 
     def ask() -> None:
         try:
-            headers = {"Content-Type": "application/json"} if body else {}
-            request = urllib.request.Request(url, body, {"User-Agent": "beadline", **headers})
+            headers = {"User-Agent": "beadline"} | ({"Content-Type": "application/json"} if body else {})
+            request = urllib.request.Request(url, body, headers)
             if request.type not in ("http", "https"):
                 raise ValueError(request.type)  # a file of this machine wakes nobody
-            asked = request.full_url
             with urllib.request.urlopen(request, timeout=ASKED_S) as answer:
                 # on the way to another URL the alarm is lost
-                sent_on = body is not None and answer.url != asked
+                sent_on = body is not None and answer.url != request.full_url
             troubles[:] = ["it sends on to another URL; write that one"] if sent_on else []
         except Exception as error:  # whatever it is, it must not hide the night, nor tell the URL
             troubles[:] = [_refusal(error)]
@@ -202,8 +200,7 @@ def _refusal(error: Exception) -> str:
     """Why a server could not be asked, without its URL, which may hold a secret."""
     if isinstance(error, urllib.error.HTTPError):
         return f"it answered with status {error.code}"
-    if isinstance(error, urllib.error.URLError) and isinstance(error.reason, OSError):
-        return error.reason.strerror or type(error.reason).__name__
-    if isinstance(error, OSError):
-        return error.strerror or type(error).__name__
+    reason = getattr(error, "reason", error)
+    if isinstance(reason, OSError):
+        return reason.strerror or type(reason).__name__
     return "this is no URL of the form https://server/path"

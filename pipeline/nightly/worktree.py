@@ -12,21 +12,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.nightly import inputs
-from pipeline.nightly.processes import (
-    STATE,
-    TOKEN,
-    configure,
-    dvc,
-    end_orphans,
-    git,
-    identity,
-    names,
-    remove_stale_locks,
-)
+from pipeline.nightly.processes import STATE, configure, dvc, git, identity, names, remove_stale_locks
 from pipeline.nightly.reproducing import read_stages
 from pipeline.store import artifacts
 
-LOCK, COPY = STATE / "lock", STATE / "copy"
+LOCK, COPY, OLD = STATE / "lock", STATE / "copy", STATE / "copy.old"
 LINKED = ("datasets/raw", "datasets/holdout")
 # a younger recording may still grow: it is copied as it is, and the next night finds it changed
 YOUNG_S = 600.0
@@ -60,14 +50,12 @@ def locked() -> Generator[None]:
     descriptor = os.open(LOCK, os.O_RDWR | os.O_CREAT)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.environ[TOKEN] = str(Path.cwd())
         yield
     except BlockingIOError:
         raise BusyError(
             "another night is at work; this one changed nothing; run it again when that has ended"
         ) from None
     finally:
-        os.environ.pop(TOKEN, None)
         os.close(descriptor)
 
 
@@ -104,15 +92,15 @@ def take() -> Snapshot:
 
 
 def make(snapshot: Snapshot, sources: Sequence[str]) -> None:
-    """The copy with all that a night needs: the files that git has or does not have yet, `sources` among
-    them, the files and folders that it reads; recordings; memos; the outs of the stages."""
+    """The copy with all that a night needs: the files that git has or does not have yet, the files among
+    `sources` that it ignores; recordings; memos; the outs of the stages."""
     make_bare(snapshot)
-    for place in LINKED:
+    for place in map(Path, LINKED):
         if (COPY / place).is_symlink():
             (COPY / place).unlink()
         shutil.rmtree(COPY / place, ignore_errors=True)
-        if Path(place).exists():
-            link(Path(place), COPY / place, sources)
+        if place.exists():
+            link(place, COPY / place, sources)
     for name in (*names("ls-files", "--others", "--exclude-standard"), *sources):
         if Path(name).is_file() and not (COPY / name).exists():
             (COPY / name).parent.mkdir(parents=True, exist_ok=True)
@@ -168,13 +156,11 @@ def _share_dvc() -> None:
 
 def link(source: Path, target: Path, sources: Sequence[str] = ()) -> None:
     """The tree of `source` made of hard links: DVC adds nothing below a folder that is a link itself. On
-    another disk a file is a link. A folder that is one stays one, unless the night reads something below it,
-    `sources`: what the night moves there is then not the project's own file."""
-    if (
-        source.is_symlink()
-        and source.is_dir()
-        and not any(inputs.lies_in(name, [str(source)]) for name in sources)
-    ):
+    another disk a file is a link. What may still grow is copied as it is, and what is no file is left out. A
+    folder that is a link stays one, unless the night reads something below it, `sources`: what the night
+    moves there is then not the project's own file."""
+    is_read = any(inputs.lies_in(name, [str(source)]) for name in sources)
+    if source.is_dir() and source.is_symlink() and not is_read:
         target.symlink_to(source.resolve())
     elif source.is_dir():
         target.mkdir(parents=True, exist_ok=True)
@@ -190,19 +176,22 @@ def link(source: Path, target: Path, sources: Sequence[str] = ()) -> None:
 
 
 def remove() -> None:
-    """Nothing is left of the copy."""
+    """Nothing is left of the copy. It is renamed first: a stage of a killed night that writes until it ends,
+    a moment later, does not write into the next copy."""
+    shutil.rmtree(OLD, ignore_errors=True)
     if COPY.is_symlink():
         COPY.unlink()
-    shutil.rmtree(COPY, ignore_errors=True)
+    with contextlib.suppress(OSError):  # there is none, or no room: then it goes where it is
+        COPY.rename(OLD)
+    for place in (OLD, COPY):
+        shutil.rmtree(place, ignore_errors=True)
     git("worktree", "prune", check=False)
 
 
 def clear_killed() -> list[str]:
-    """Ends and removes what a killed night left, as sentences."""
+    """Removes what a killed night left, and says so."""
     if not COPY.exists():
         return []
-    ended = end_orphans()
     remove_stale_locks()
     remove()
-    running = f" and had left {ended} processes running; they were ended" if ended else ""
-    return [f"the night before was killed{running}"]
+    return ["the night before was killed"]

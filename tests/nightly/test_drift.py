@@ -6,6 +6,7 @@ import scipy.linalg
 
 from pipeline.nightly import baseline, drift, mistakes
 from pipeline.nightly.baseline import Baseline
+from pipeline.store import artifacts
 from pipeline.temperature.plant import Plant, plant, simulate
 from pipeline.temperature.tracking import robust_observer_gain
 
@@ -191,12 +192,33 @@ def test_what_the_champions_own_model_gets_wrong_of_its_nights_is_no_change_of_a
         assert explained(machine, blind, record(honest, seed))[1].named == []
 
 
-def test_a_baseline_comes_back_from_its_file(own):
-    again = Baseline.read(own.to_json())
-    for name in ("scale", "changes"):
-        for before, after in zip(getattr(own, name), getattr(again, name), strict=True):
-            np.testing.assert_array_equal(before, after)
+def test_a_baseline_comes_back_from_its_file(own, tmp_path):
+    own = own._replace(changes=((drift.DriftCause("gain", 0), -0.1), (drift.DriftCause("offset", 1), 2.0)))
+    artifacts.write_json(tmp_path / "own.json", own.to_json())
+    again = Baseline.read(artifacts.read_json(tmp_path / "own.json"))
+    assert again.changes == own.changes
+    for before, after in zip(own.scale, again.scale, strict=True):
+        np.testing.assert_array_equal(before, after)
     np.testing.assert_array_equal(own.values, again.values)
+
+
+def test_a_baseline_of_version_2_is_read_as_one_of_version_3(own):
+    none = [0.0, 0.0]
+    by_name = {
+        "gain": [0.01, 0.0],
+        "rate": none,
+        "delay": none,
+        "cap": [1e9, 62.0],
+        "offset": none,
+        "late": none,
+    }
+    scale = {name: np.asarray(value).tolist() for name, value in own.scale._asdict().items()}
+    before = own.to_json() | {"changes": dict(sorted(by_name.items())), "scale": dict(sorted(scale.items()))}
+    again = Baseline.read(baseline.rewrite(before))
+    expected = {(drift.DriftCause("gain", 0), 0.01), (drift.DriftCause("saturation", 1), 62.0)}
+    assert {*again.changes} == expected
+    for now, then in zip(again.scale, own.scale, strict=True):
+        np.testing.assert_array_equal(now, then)
 
 
 def test_every_rate_scaled_back_is_the_plant_again():

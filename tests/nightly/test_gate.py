@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.cli import render_night
 from pipeline.deposition.tables import SCORES
-from pipeline.nightly import champion, judge, night, promoting, reporting, reproducing, screening, verdicts
+from pipeline.nightly import champion, judge, night, promoting, reporting, reproducing, screening
 from pipeline.nightly.decision import CaseCosts
 from pipeline.nightly.records import CANDIDATE, FIRST, KEPT, PROMOTED, Champion, ChampionState, Night
 from pipeline.nightly.settings import Nightly
@@ -75,7 +75,7 @@ def project(passing, monkeypatch):
     monkeypatch.setattr(judge, "judge", lambda *_: judge.Judge(measure, lambda _: {"worst_case": 0.1}))
     monkeypatch.setattr(screening, "reference", lambda *_: None)
     monkeypatch.setattr(champion, "remove", lambda _: None)
-    monkeypatch.setattr(champion, "install", lambda _, files, __: ({"md5": "0"}, md5s(files)))
+    monkeypatch.setattr(champion, "hand_over", lambda _, files, __: ({"md5": "0"}, md5s(files)))
     return folder
 
 
@@ -384,43 +384,39 @@ def page_sources() -> Sources:
 @pytest.mark.parametrize("key", ["", "watched", "alarms"])
 def test_the_night_goes_by_the_verdicts_that_the_pages_show(project, key):
     drift(key)(None)
-    by_loop = verdicts.read_verdicts(settings(), make_tonight())
+    by_loop = promoting.read_verdicts(settings(), make_tonight())
     assert by_loop == page_sources().verdicts and by_loop.keys() == LOOPS.keys()
 
 
 def test_a_loop_whose_verdict_is_missing_is_never_promoted(project):
     Path("datasets/verdict/deposition.json").unlink()
     with pytest.raises(ValueError, match=r"^datasets/verdict/deposition\.json: expected the verdict"):
-        verdicts.read_verdicts(settings(), make_tonight())
+        promoting.read_verdicts(settings(), make_tonight())
 
 
-def test_the_report_keeps_the_verdict_of_each_loop_as_the_night_reads_it(project, monkeypatch):
+def test_the_report_keeps_the_verdicts_of_the_night_and_is_made_anew_if_they_have_changed(
+    project, monkeypatch
+):
     made.main()
     made_anew = []
-    monkeypatch.setattr(verdicts, "dvc", lambda *command, **_: made_anew.append(command))
+
+    def repro(*command, **_):
+        made_anew.append(command)
+        if len(made_anew) > 1:
+            raise ValueError("dvc repro failed: no room")
+
+    monkeypatch.setattr(promoting, "dvc", repro)
     tonight = make_tonight()
-    by_loop = verdicts.read_verdicts(settings(), tonight)
+    by_loop = promoting.read_verdicts(settings(), tonight)
     kept = artifacts.read_figures("report")
     assert kept["verdicts"] == {loop: verdict.metrics() for loop, verdict in by_loop.items()}
     assert kept["verdict"] == by_loop["temperature"].metrics()
     assert made_anew == [] and tonight == make_tonight()
     # the drift that they were made with is over since: they are made anew, so that both say the same
     drift("alarms")(None)
-    verdicts.read_verdicts(settings(), make_tonight())
-    assert made_anew == [("repro", "--single-item", "--force", "report")]
-
-
-def test_pages_that_cannot_be_made_anew_are_told_and_the_night_goes_on(project, monkeypatch):
-    made.main()
-    drift("alarms")(None)
-
-    def refused(*_, **__):
-        raise ValueError("dvc repro failed: no room")
-
-    monkeypatch.setattr(verdicts, "dvc", refused)
-    tonight = make_tonight()
-    by_loop = verdicts.read_verdicts(settings(), tonight)
-    assert by_loop["temperature"].state == FAILED
+    for _ in range(2):
+        assert promoting.read_verdicts(settings(), tonight)["temperature"].state == FAILED
+    assert made_anew == 2 * [("repro", "--single-item", "--force", "report")]
     assert tonight.notes == [
         "the pages are not of tonight (dvc repro failed: no room); run ./run dvc repro --force report"
     ]
@@ -429,14 +425,14 @@ def test_pages_that_cannot_be_made_anew_are_told_and_the_night_goes_on(project, 
 def test_a_contestant_that_is_named_to_run_must_pass_itself(project):
     stages = made.metrics()
     own = stages["evaluate_temperature"]["contestants"]["varx_riccati"]
-    assert verdicts.read_verdicts(settings(controller="varx_riccati"), make_tonight())[
+    assert promoting.read_verdicts(settings(controller="varx_riccati"), make_tonight())[
         "temperature"
     ].winner == ("varx_riccati")
     own["overshoot"] = made.figure(9.0, 8.0, 10.0)
     artifacts.write_metrics("evaluate_temperature", stages["evaluate_temperature"])
     stage_verdict.main()
     by_page, named = (
-        verdicts.read_verdicts(settings(controller=name), make_tonight())["temperature"]
+        promoting.read_verdicts(settings(controller=name), make_tonight())["temperature"]
         for name in ("page", "varx_riccati")
     )
     assert (by_page.state, by_page.winner) == (PASSED, "subspace_lqg")
@@ -448,13 +444,13 @@ def test_a_contestant_that_is_named_to_run_must_pass_itself(project):
     assert tonight.decisions["temperature"].decision == CANDIDATE
     assert after.candidates["temperature"].contestant == "varx_riccati"
     # one that was not judged at all is open
-    lost = verdicts.read_verdicts(settings(controller="printer_pid"), make_tonight())["temperature"]
+    lost = promoting.read_verdicts(settings(controller="printer_pid"), make_tonight())["temperature"]
     assert lost.state == OPEN and lost.subject == "printer_pid" and "was not judged" in lost.reason
 
 
 def test_what_runs_stays_where_the_page_finds_nobody_better_beyond_the_bands(project):
     """The page's incumbent is the champion's contestant, where there is one."""
-    assert verdicts.read_verdicts(settings(), make_tonight())["temperature"].winner == "subspace_lqg"
+    assert promoting.read_verdicts(settings(), make_tonight())["temperature"].winner == "subspace_lqg"
     present = other()._replace(contestant="varx_riccati")
     state = ChampionState({"temperature": present})
     artifacts.write_json(NIGHTLY, make_tonight().metrics(state))
@@ -472,21 +468,14 @@ def test_the_champion_and_the_challenger_are_each_judged_as_their_own_contestant
         return CaseCosts("panel", {f"case {k}": (f"plant {k}", 1.0) for k in range(8)}, {"worst_case": 1.0})
 
     monkeypatch.setattr(judge, "judge", lambda *_: judge.Judge(measure, lambda _: {}))
-    verdict = verdicts.read_verdicts(settings(), make_tonight())["temperature"]
-    for present in (other()._replace(contestant="pi_simc"), other()):
-        state = ChampionState({"temperature": present})
-        promoting.judge_loop(settings(), "temperature", make_tonight(), state, verdict)
-    # one that was promoted before champion.json said so is what the night judged then
-    assert asked == [
-        ("datasets", "subspace_lqg"),
-        ("champion/temperature", "pi_simc"),
-        ("datasets", "subspace_lqg"),
-        ("champion/temperature", "varx_riccati"),
-    ]
+    verdict = promoting.read_verdicts(settings(), make_tonight())["temperature"]
+    state = ChampionState({"temperature": other()._replace(contestant="pi_simc")})
+    promoting.judge_loop(settings(), "temperature", make_tonight(), state, verdict)
+    assert asked == [("datasets", "subspace_lqg"), ("champion/temperature", "pi_simc")]
 
 
 def test_the_same_files_as_another_contestant_are_another_challenger(project):
-    verdict = verdicts.read_verdicts(settings(), make_tonight())["temperature"]
+    verdict = promoting.read_verdicts(settings(), make_tonight())["temperature"]
     files = md5s(LOOPS["temperature"])
     decisions = {
         contestant: promoting.judge_loop(
@@ -495,7 +484,7 @@ def test_the_same_files_as_another_contestant_are_another_challenger(project):
             make_tonight(),
             ChampionState({"temperature": other()._replace(files=files, contestant=contestant)}),
             said,
-        )[0]
+        )
         for contestant, said in (
             ("subspace_lqg", verdict),
             ("pi_simc", verdict),
@@ -514,8 +503,8 @@ def test_the_same_files_as_another_contestant_are_another_challenger(project):
 
 
 def test_a_champion_that_would_lack_what_it_is_designed_from_is_not_promoted(project):
-    verdict = verdicts.read_verdicts(settings(), make_tonight())["temperature"]._replace(subject="pi_simc")
-    decided, _ = promoting.judge_loop(settings(), "temperature", make_tonight(), ChampionState(), verdict)
+    verdict = promoting.read_verdicts(settings(), make_tonight())["temperature"]._replace(subject="pi_simc")
+    decided = promoting.judge_loop(settings(), "temperature", make_tonight(), ChampionState(), verdict)
     assert decided.decision == KEPT and decided.reasons == [
         "pi_simc is designed from datasets/identify_plant/spread.parquet, which the champion would lack; add "
         "it to nightly.loops.temperature.artifacts"
@@ -569,7 +558,7 @@ def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(play
         monkeypatch.setattr(reproducing, "reproduce", reproduce)
         verdict = Verdict("deposition", state, *words_of[state], "", "", "", "basis", subject="basis")
         verdict = verdict._replace(rehearsal=True)
-        monkeypatch.setattr(verdicts, "read_verdicts", lambda settings, night: {"deposition": verdict})
+        monkeypatch.setattr(promoting, "read_verdicts", lambda settings, night: {"deposition": verdict})
         Path("learn.py").write_text(f"# night {number}\n")
         status, summary = night.nightly(render_night)
         assert status == reporting.OK, summary
@@ -580,10 +569,10 @@ def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(play
     assert "promoted" not in summary
     candidate = state["candidates"]["deposition"]
     assert not state["champions"] and not state["history"]
-    assert candidate["run"] == "night-0001" and candidate["files"] and candidate["lineage"]["commit"]
+    assert candidate["run"] == "night-0001" and candidate["files"]
     assert (candidate["contestant"], candidate["rehearsal"]) == ("basis", True)
     assert candidate["why"] == candidate["verdict"] == "Fail (simulation). First failed rule: flow error."
-    assert candidate["metrics"]["mean_cost"] == 1.0
+    assert candidate["lineage"]["uncommitted"] == ["learn.py", "params.yaml"]
     assert played.production_of("deposition.candidate") == {"compose_parts/x": b"one"}
     # the same challenger again stays the candidate of the night that made it, and its files are as they were
     before = played.head()

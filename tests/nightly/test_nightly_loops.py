@@ -14,11 +14,11 @@ from pipeline.nightly import (
     champion,
     inputs,
     night,
+    promoting,
     remembered,
     reporting,
     reproducing,
     screening,
-    verdicts,
     watch,
 )
 from pipeline.nightly.records import Alarm, Memory, Night, NightDrift
@@ -44,9 +44,16 @@ def project(empty, tmp_path, monkeypatch):
     """A project with one loop, whose stages score what the test says in place of `dvc repro`, and whose pages
     pass."""
     copy = entered(empty, tmp_path / "toy", monkeypatch)
-    monkeypatch.setattr(verdicts, "read_verdicts", lambda settings, night: dict(map(passing, settings.loops)))
+    monkeypatch.setattr(
+        promoting, "read_verdicts", lambda settings, night: dict(map(passing, settings.loops))
+    )
     Path("dvc.lock").write_text("schema: '2.0'\nstages: {}\n")
     return copy
+
+
+def own(*names: str) -> dict[str, dict]:
+    """These loops as section nightly has them, without recordings."""
+    return {loop: {"judge": loop, "cases": "", "recordings": "", "artifacts": LOOPS[loop]} for loop in names}
 
 
 def passing(loop: str) -> tuple[str, Verdict]:
@@ -102,7 +109,7 @@ def setpoint(cost: float, guard: float) -> None:
 def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_guard_is_not(
     project, monkeypatch, loop, score
 ):
-    project.set(loops={loop: {"judge": loop, "cases": "", "recordings": "", "artifacts": LOOPS[loop]}})
+    project.set(loops=own(loop))
     # cost, guard, and what the night must say of it
     nights = [
         (10.0, 2.0, "first champion", ""),
@@ -122,23 +129,18 @@ def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_gua
             status == reporting.OK and decided.decision == decision and reason in " ".join(decided.reasons)
         ), (summary, decided)
         assert champion.read().champions[loop].run == ("night-0005" if k >= 4 else "night-0001")
-    # production holds what was promoted, not what was scored last, and says on what it was judged
+    # production holds what was promoted, not what was scored last
     present = champion.read().champions[loop]
     assert present.rehearsal and present.contestant == "ours"
-    metrics = present.metrics
-    assert metrics and metrics["mean_cost"] == pytest.approx(
-        8.0 + 0.35 + (1.0 if loop == "setpoint" else 0.0)
-    )
 
 
 def test_a_loop_that_is_switched_off_is_no_part_of_the_night(project, monkeypatch):
-    own = {loop: {"judge": loop, "cases": "", "recordings": "", "artifacts": LOOPS[loop]} for loop in LOOPS}
     alarm = Alarm("setpoint", "setpoint: ink", "a print", "the ink looks different", 9.0)
     monkeypatch.setattr(
         reproducing, "reproduce", lambda *_, **__: played(deposition(10.0, 2.0), setpoint(10.0, 2.0))
     )
     remembered.write(Memory(alarms=[alarm], recordings={"setpoint": {}}))
-    project.set(loops_on={"setpoint": False}, loops=own)
+    project.set(loops_on={"setpoint": False}, loops=own(*LOOPS))
     status, summary = night.nightly(render_night)
     tonight = remembered.read().nights[-1]
     assert status == reporting.OK and tonight.promoted == ["deposition"], summary
@@ -146,19 +148,18 @@ def test_a_loop_that_is_switched_off_is_no_part_of_the_night(project, monkeypatc
     assert list(tonight.decisions) == list(champion.read().champions) == ["deposition"]
     assert not tonight.drift.alarms
     # switched on, the night has it again
-    project.set(loops=own)
+    project.set(loops=own(*LOOPS))
     status, summary = night.nightly(render_night)
     assert status == reporting.OK and "promoted setpoint" in summary and "no part" not in summary
     # without any there is nothing to do
-    project.set(loops_on=dict.fromkeys(own, False), loops=own)
+    project.set(loops_on=dict.fromkeys(LOOPS, False), loops=own(*LOOPS))
     monkeypatch.setattr(reproducing, "reproduce", lambda *_, **__: pytest.fail("no stage is asked"))
     status, summary = night.nightly(render_night)
     assert status == reporting.OK and "section loops switches off every loop" in summary
 
 
 def test_every_section_of_the_parameters_is_checked_before_the_first_stage(project, monkeypatch):
-    own = {"judge": "deposition", "cases": "", "recordings": "", "artifacts": LOOPS["deposition"]}
-    project.set(loops={"deposition": own})
+    project.set(loops=own("deposition"))
     written = Path("params.yaml").read_text()
     Path("params.yaml").write_text(written.replace('"max_order"', '"max_ordre"'))
     monkeypatch.setattr(reproducing, "reproduce", lambda *_, **__: pytest.fail("no stage is asked"))
@@ -168,22 +169,11 @@ def test_every_section_of_the_parameters_is_checked_before_the_first_stage(proje
 
 
 def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(project, monkeypatch):
-    project.set(
-        loops={
-            "deposition": {
-                "judge": "deposition",
-                "cases": "",
-                "recordings": "datasets/raw/deposition",
-                "artifacts": LOOPS["deposition"],
-            }
-        }
-    )
-    root = Path(__file__).resolve().parents[2]
-    camera = {}
-    for sections in params.files(root / "params.yaml").values():
-        camera |= sections["camera"]
-    said = json.loads(Path("params.yaml").read_text())
-    Path("params.yaml").write_text(json.dumps(said | {"camera": camera}))
+    recordings = {"recordings": "datasets/raw/deposition"}
+    project.set(loops={"deposition": own("deposition")["deposition"] | recordings})
+    sections = json.loads(Path("params.yaml").read_text())
+    camera = params.read(Path(__file__).resolve().parents[2] / "params.yaml")["camera"]
+    Path("params.yaml").write_text(json.dumps(sections | {"camera": camera}))
     monkeypatch.setattr(reproducing, "reproduce", lambda *_, **__: played(deposition(10.0, 2.0)))
     status, summary = night.nightly(render_night)
     assert status == reporting.OK, summary
@@ -216,16 +206,7 @@ def test_the_gravest_of_a_night_is_its_exit_status():
 
 
 def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project, monkeypatch):
-    project.set(
-        loops={
-            "deposition": {
-                "judge": "deposition",
-                "cases": "",
-                "recordings": "",
-                "artifacts": LOOPS["deposition"],
-            }
-        }
-    )
+    project.set(loops=own("deposition"))
     monkeypatch.setattr(reproducing, "reproduce", lambda *_, **__: played(deposition(10.0, 2.0)))
     assert night.nightly(render_night)[0] == reporting.OK
     with pytest.raises(
@@ -253,11 +234,7 @@ def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project,
 
 
 def test_an_alarm_of_the_setpoint_camera_changes_nothing_for_another_loop(project, monkeypatch):
-    both = {
-        loop: {"judge": loop, "cases": "", "recordings": "", "artifacts": LOOPS[loop]}
-        for loop in ("deposition", "setpoint")
-    }
-    project.set(loops=both)
+    project.set(loops=own(*LOOPS))
     monkeypatch.setattr(
         reproducing, "reproduce", lambda *_, **__: played(deposition(10.0, 2.0), setpoint(10.0, 2.0))
     )

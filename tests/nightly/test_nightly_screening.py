@@ -239,7 +239,7 @@ def test_each_night_of_the_champion_is_held_against_a_model_identified_without_i
         [tuple(np.column_stack([one[f"{kind}_1"], one[f"{kind}_2"]]) for kind in ("heater", "sensor"))]
         for one in shifts
     ]
-    models = temperature_drift._without_each(params.load(Plant, "plant"), segments)
+    models = temperature_drift._without_each(params.load(Plant, "plant"), segments, 600)
     # nights share models: 0 and 4, 1 and 5
     assert len(models) == 6 and models[0] is models[4] and models[1] is models[5]
     first = [float(one["sensor_1"][0]) for one in shifts]
@@ -385,7 +385,7 @@ def as_bag(folder: Path, columns, parts: int = 2) -> dict[str, str]:
         (folder / name).write_bytes(made_part.bytes())
     information = {"version": 5, "storage_identifier": "mcap", "relative_file_paths": names}
     (folder / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": information}))
-    digests = inputs.contents(inputs.Hashes({}), [str(RAW)])
+    digests = inputs.contents([str(RAW)], {})
     return inputs.recordings(digests, params.load(Nightly, "nightly").loops["temperature"])
 
 
@@ -428,7 +428,7 @@ def test_a_copy_that_is_not_complete_is_no_recording_of_the_night_and_is_not_set
     growing, partial = tmp_path / "rig.csv", tmp_path / "rig.csv.part"
     growing.write_text("time_s,T1\n")
     partial.write_text("time")
-    assert list(inputs.contents(inputs.Hashes({}), [str(tmp_path)])) == [growing.as_posix()]
+    assert list(inputs.contents([str(tmp_path)], {})) == [growing.as_posix()]
     monkeypatch.setattr(plain_files, "REST_S", 10.0)
     monkeypatch.setattr(plain_files.time, "sleep", lambda _: growing.write_text("time_s,T1\n0,1\n"))
     assert "is still being written: it stays" in inputs.quarantine(str(growing), "temperature", "too short")

@@ -5,13 +5,14 @@ import fcntl
 import json
 import os
 import subprocess
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline.cli import render_night
-from pipeline.nightly import by_hand, champion, night, remembered, reporting, worktree
+from pipeline.nightly import by_hand, champion, night, processes, remembered, reporting, worktree
 from pipeline.store import artifacts
 from tests.nightly.toy_nights import DVC, SETTINGS, Project, entered
 
@@ -65,42 +66,29 @@ def learned() -> float:
 # ---- what is used
 
 
-def test_a_new_untracked_recording_is_used_and_nothing_is_installed(project):
+def test_a_new_recording_and_uncommitted_files_are_used_and_all_is_on_the_disk_before_the_commit(
+    project, monkeypatch
+):
+    (project.folder / "learn.py").write_text(Path("learn.py").read_text() + "\nimport helper\n")
+    (project.folder / "helper.py").write_text("assert True")
     project.record("new", [9.0, 9.0, 9.0])
-    assert "promoted toy" in run()
+    written, on_disk, write, move = [], [], champion._write_through, night.landing.move
+    monkeypatch.setattr(champion, "_write_through", lambda path: written.append(path.name) or write(path))
+    monkeypatch.setattr(night.landing, "move", lambda *to: on_disk.extend(written) or move(*to))
+    summary, present = run(), champion.read().champions["toy"]
+    assert "promoted toy" in summary and "not committed: learn.py" in summary
     assert learned() == 10.0 and project.production()["learn/model.json"] == b"10.0"
+    assert present.lineage["uncommitted"] == ["learn.py"]
+    assert {md5[2:] for md5 in (present.md5, *present.files.values())} <= {*on_disk}
     # the commit names the recording, and what was made of it
     paths = project.run("git", "show", "--name-only", "--format=", "HEAD").stdout.split()
     assert {"datasets/raw/toy/new.csv", "dvc.lock", "champion.json", "champion/toy.dvc"} <= {*paths}
     assert all(
         path.startswith(("reports/metrics/", "datasets/raw", "champion", "dvc.lock")) for path in paths
     )
-    assert project.dirty() == [] and not list(Path().glob("**/.venv"))
+    assert project.dirty() == [" M learn.py", "?? helper.py"] and not list(Path().glob("**/.venv"))
     tags = project.run("git", "tag", "--points-at", "HEAD").stdout.split()
     assert tags == ["production/toy/night-0002"]
-    assert "nothing new" in run()
-
-
-def test_what_is_promoted_is_on_the_disk_before_a_commit_names_it(project, monkeypatch):
-    written, write, move = [], champion._write_through, night.landing.move
-    monkeypatch.setattr(champion, "_write_through", lambda path: written.append(path.name) or write(path))
-    synced = []
-    monkeypatch.setattr(night.landing, "move", lambda *to: synced.extend(written) or move(*to))
-    project.record("new", [9.0, 9.0, 9.0])
-    run()
-    present = champion.read().champions["toy"]
-    assert {md5[2:] for md5 in (present.md5, *present.files.values())} <= {*synced}
-
-
-def test_what_lies_uncommitted_is_used_and_named(project):
-    (project.folder / "learn.py").write_text(Path("learn.py").read_text() + "\nimport helper\n")
-    (project.folder / "helper.py").write_text("assert True")
-    project.record("new", [9.0, 9.0, 9.0])
-    summary = run()
-    assert "promoted toy" in summary and "not committed: learn.py" in summary
-    lineage = champion.read().champions["toy"].lineage
-    assert lineage["uncommitted"] == ["learn.py"] and lineage["recordings"]["toy"]
-    assert project.dirty() == [" M learn.py", "?? helper.py"]
 
 
 def test_recordings_that_dvc_keeps_are_used_and_their_pointer_moves(project):
@@ -134,22 +122,17 @@ def test_the_remote_is_reached_by_a_path_of_this_project_and_a_clone_has_the_cha
     assert "nothing new" not in run()
 
 
-def test_an_idle_night_is_a_success_with_a_note_and_idle_nights_are_counted(project):
+def test_idle_nights_are_counted_and_a_change_of_code_or_parameters_is_something_new(project):
     assert "no new recording: drift was not measured" in run()
     assert "no new recording for 2 nights" in run()
-    Path("learn.py").write_text(Path("learn.py").read_text() + "# other code\n")
-    assert "no new recording for 3 nights" in run() and remembered.read().nights[-1].idle == 3
+    for idle, file in enumerate(("learn.py", "params.yaml", "params.expert.yaml"), 3):
+        Path(file).write_text(Path(file).read_text() + "\n# another comment\n")
+        summary = run()
+        assert f"no new recording for {idle} nights" in summary and "nothing new" not in summary
+        assert "not committed: " in summary and file in summary
+    assert remembered.read().nights[-1].idle == 5 and "nothing new" in run()
     project.record("new", [9.0])
     assert "no new recording" not in run()
-
-
-@pytest.mark.parametrize("file", ["params.yaml", "params.expert.yaml"])
-def test_a_change_of_either_file_of_parameters_is_something_new(project, file):
-    assert "nothing new" in run()
-    Path(file).write_text(Path(file).read_text() + "\n# another comment\n")
-    summary = run()
-    assert "nothing new" not in summary and f"not committed: {file}" in summary
-    assert "nothing new" in run()
 
 
 def test_a_recording_that_is_not_used_says_which_parameter_would_use_it(project):
@@ -175,15 +158,6 @@ def test_a_recording_that_is_not_used_says_which_parameter_would_use_it(project)
 # ---- promote, keep, roll back
 
 
-def test_a_worse_challenger_changes_the_run_and_not_production(project):
-    before, head = project.production(), project.head()
-    project.record("worse", [30.0])
-    assert "kept" in run() and "the challenger is no better" in remembered.read().nights[-1].reasons[0]
-    assert project.production() == before and learned() == 15.75
-    assert project.head() != head and champion.read().champions["toy"].run == "night-0001"
-    assert project.dirty() == []
-
-
 def test_a_dry_run_names_what_is_new_and_changes_nothing(project):
     idle = project.beadline("nightly", "--dry-run")
     assert (idle.returncode, idle.stderr) == (0, "") and "a run would do nothing" in idle.stdout
@@ -195,8 +169,14 @@ def test_a_dry_run_names_what_is_new_and_changes_nothing(project):
     assert project.run("git", "status", "--porcelain").stdout == files
 
 
-def test_rollback_goes_back_bit_by_bit_and_what_was_rolled_back_does_not_return(project):
-    one = project.production()
+def test_a_worse_challenger_stays_out_and_rollback_goes_back_bit_by_bit_for_good(project):
+    one, head = project.production(), project.head()
+    worse = project.record("worse", [30.0])
+    assert "kept" in run() and "the challenger is no better" in remembered.read().nights[-1].reasons[0]
+    assert project.production() == one and learned() == 15.75
+    assert project.head() != head and champion.read().champions["toy"].run == "night-0001"
+    assert project.dirty() == []
+    worse.unlink()
     project.record("better", [9.5, 9.5])
     run()
     two = project.production()
@@ -205,32 +185,32 @@ def test_rollback_goes_back_bit_by_bit_and_what_was_rolled_back_does_not_return(
     assert len({str(files) for files in (one, two, project.production())}) == 3
     before = project.run("git", "rev-parse", "HEAD").stdout
     foretold = project.beadline("nightly", "--rollback", "--dry-run")
-    assert foretold.stdout == "rollback, dry run: toy would be night-0002 again; nothing was changed\n"
+    assert foretold.stdout == "rollback, dry run: toy would be night-0003 again; nothing was changed\n"
     assert project.run("git", "rev-parse", "HEAD").stdout == before
-    assert by_hand.rollback("", "").startswith("rollback: toy is night-0002 again")
+    assert by_hand.rollback("", "").startswith("rollback: toy is night-0003 again")
     assert project.production() == two
     by_hand.rollback("", "")
     assert project.production() == one and project.dirty() == []
     Path("learn.py").write_text(Path("learn.py").read_text() + "# the same challenger again\n")
     assert "which was rolled back by hand" in run() and project.production() == one
-    with pytest.raises(ValueError, match="night-0001 is in production already"):
-        by_hand.rollback("night-0001", "")
-    with pytest.raises(ValueError, match="known are: night-0001 \\(toy\\), night-0002 \\(toy\\)"):
-        by_hand.rollback("night-0042", "")
-    with pytest.raises(ValueError, match="found other; loops with a champion are: toy"):
-        by_hand.rollback("", "other")
+    for to, loop, sentence in (
+        ("night-0001", "", "night-0001 is in production already"),
+        ("night-0042", "", "known are: night-0001 \\(toy\\), night-0003 \\(toy\\)"),
+        ("", "other", "found other; loops with a champion are: toy"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            by_hand.rollback(to, loop)
 
 
-@pytest.mark.parametrize("lost", ["learn/weights.bin", "the list of its files"])
-def test_a_champion_whose_files_no_cache_and_no_remote_has_is_not_gone_back_to(project, lost):
+def test_a_champion_whose_files_no_cache_and_no_remote_has_is_not_gone_back_to(project):
     project.record("better", [9.0, 9.0, 9.0])
     run()
     after, earlier = project.production(), champion.read().history[0].champion
-    md5 = earlier.files.get(lost, earlier.md5)
-    Path(".dvc/cache/files/md5", md5[:2], md5[2:]).unlink()
-    with pytest.raises(ValueError, match="is not what it was in night-0001; bring DVC's cache"):
-        by_hand.rollback("", "")
-    assert project.production() == after and project.dirty() == [] and not worktree.COPY.exists()
+    for md5 in (earlier.files["learn/weights.bin"], earlier.md5):  # a file, and the list of them all
+        Path(".dvc/cache/files/md5", md5[:2], md5[2:]).unlink()
+        with pytest.raises(ValueError, match="is not what it was in night-0001; bring DVC's cache"):
+            by_hand.rollback("", "")
+        assert project.production() == after and project.dirty() == [] and not worktree.COPY.exists()
 
 
 @pytest.fixture(scope="module")
@@ -326,29 +306,39 @@ def test_what_the_owner_commits_edits_and_stages_meanwhile_stays(project, monkey
     assert {*project.dirty()} == states and learned() == 10.0
 
 
-def test_a_commit_of_what_the_night_is_made_from_ends_it_with_nothing_changed(project, monkeypatch):
+@pytest.mark.parametrize("act", ["commits", "switches", "records"])
+def test_what_the_night_is_made_from_changes_meanwhile_and_nothing_is_changed(project, monkeypatch, act):
+    recording = project.record("old", [9.0, 9.0, 9.0])
+    os.utime(recording, (1e9, 1e9))
+
     def commit():
         Path("learn.py").write_text(Path("learn.py").read_text() + "# later\n")
         project.run("git", "commit", "-qam", "other code")
 
-    before = project.production()
-    during_the_stages(monkeypatch, commit)
-    project.record("better", [9.0, 9.0, 9.0])
-    assert "learn.py was committed while the night ran" in run(reporting.FAILED)
+    acts = {
+        "commits": (commit, "learn.py was committed while the night ran"),
+        "switches": (
+            lambda: project.run("git", "switch", "-qc", "experiment"),
+            "refs/heads/experiment was checked out while the night ran",
+        ),
+        "records": (
+            lambda: recording.open("a").write("\n50.0\n"), "old.csv changed while the stages ran"
+        ),
+    }  # fmt: skip
+    before, main = project.production(), project.head()
+    with monkeypatch.context() as context:
+        during_the_stages(context, acts[act][0])
+        assert acts[act][1] in run(reporting.FAILED)
     assert project.production() == before and learned() == 11.0
-    monkeypatch.undo()
-    monkeypatch.chdir(project.folder)
-    for name, value in project.env.items():
-        monkeypatch.setenv(name, value)
+    assert recording.read_text().endswith("50.0\n") == (act == "records")
+    assert (
+        not project.run("git", "tag", "--contains", main)
+        .stdout.replace("production/toy/night-0001", "")
+        .strip()
+    )
+    project.run("git", "switch", "-q", "main")
+    recording.write_text("9.0\n9.0\n9.0")
     assert "promoted toy" in run()
-
-
-def test_a_recording_that_changes_under_the_stages_ends_the_night(project, monkeypatch):
-    recording = project.record("old", [9.0, 9.0, 9.0])
-    os.utime(recording, (1e9, 1e9))
-    during_the_stages(monkeypatch, lambda: recording.open("a").write("\n50.0\n"))
-    assert "old.csv changed while the stages ran" in run(reporting.FAILED)
-    assert learned() == 11.0 and recording.read_text().endswith("50.0\n")
 
 
 def test_a_second_night_is_refused_and_so_is_half_a_merge(project):
@@ -430,6 +420,58 @@ def test_killed_at_random_moments_all_is_as_before_or_as_after(project):
     subprocess.run(["git", "fsck", "--strict"], check=True, capture_output=True)
 
 
+def test_the_stages_of_a_night_that_is_killed_end_with_it(project):
+    Path("slow.txt").write_text("3600")
+    project.record("better", [9.0])
+    child = project.start()
+
+    def find_running() -> list[str]:
+        """Command lines of the processes that work in the copy."""
+        found = []
+        for entry in Path("/proc").glob("[0-9]*"):
+            try:
+                if Path(os.readlink(entry / "cwd")).is_relative_to(worktree.COPY.resolve()):
+                    found.append((entry / "cmdline").read_text())
+            except OSError:
+                continue
+        return found
+
+    def wait_for(stages: bool) -> None:
+        for _ in range(600):
+            if any("learn.py" in words for words in find_running()) == stages:
+                return
+            time.sleep(0.1)
+
+    wait_for(stages=True)
+    assert find_running()
+    child.kill()  # the night alone: what DVC runs has a session of its own
+    child.communicate()
+    wait_for(stages=False)
+    assert find_running() == []
+    Path("slow.txt").write_text("0")
+    assert "the night before was killed" in run() and not worktree.OLD.exists()
+
+
+def test_the_lock_of_a_git_that_works_stays_and_that_of_one_that_was_killed_goes(project):
+    lock = Path(".git/index.lock")
+    Path("learn.py").write_text(Path("learn.py").read_text() + "# other code\n")
+    editing = subprocess.Popen(
+        ["git", "commit", "-aq"],
+        env=os.environ | {"GIT_EDITOR": "sleep 60 #"},
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    while not lock.exists():
+        time.sleep(0.05)
+    processes.remove_stale_locks()
+    assert lock.exists()
+    os.killpg(editing.pid, 9)
+    editing.wait()
+    assert lock.exists()
+    processes.remove_stale_locks()
+    assert not lock.exists()
+
+
 @pytest.mark.parametrize(
     ("step", "then"),
     [("_bring_files", "night"), ("checkout", "rollback"), ("follow", "night"), ("exchange", "rollback")],
@@ -504,10 +546,10 @@ def test_a_full_disk_is_a_failed_night_that_says_so(project, tmp_path, room_mb):
         subprocess.run(["umount", "-l", disk], check=True)
 
 
-@pytest.mark.parametrize("text", ["", '{"night": "one"}', "<<<<<<< HEAD", '{"nights": {}}'])
-def test_a_broken_memory_is_told_by_the_watchdog_and_set_aside_by_the_night(project, text):
-    remembered.FILE.write_text(text)
-    status, summary = reporting.watchdog()
-    assert status == reporting.FAILED and str(remembered.FILE) in summary and remembered.FILE.exists()
+def test_a_broken_memory_is_told_by_the_watchdog_and_set_aside_by_the_night(project):
+    for text in ("", '{"night": "one"}', "<<<<<<< HEAD", '{"nights": {}}'):
+        remembered.FILE.write_text(text)
+        status, summary = reporting.watchdog()
+        assert status == reporting.FAILED and str(remembered.FILE) in summary and remembered.FILE.exists()
     assert f"it is set aside as {remembered.FILE}.broken" in run()
     assert "nothing new" in run()

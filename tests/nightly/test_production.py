@@ -16,54 +16,53 @@ from tests.conftest import ROOT
 from tests.nightly.toy_nights import SETTINGS, Project
 
 
-def put(state: ChampionState, run: str, loop: str = "toy", event: str = "promoted") -> ChampionState:
-    return champion.promote(state, loop, Champion(run, run, "", {"md5": f"{loop} {run}"}), event=event)
-
-
-def back(state: ChampionState, run: str = "", loop: str = "") -> ChampionState:
-    for name, former in champion.find_earlier(state, run, loop).items():
-        state = champion.promote(state, name, former, event="rolled back", when="by hand")
-    return state
-
-
-def present(state: ChampionState, loop: str = "toy") -> str:
-    return state.champions[loop].run
-
-
-def test_rollback_twice_goes_two_back_and_what_was_rolled_back_is_not_come_back_to():
+def play(steps: str) -> str:
+    """The runs in production after promotions (n1; bn1 of loop b), accepted drifts (n1+) and rollbacks (<;
+    <n1 to a run; <:a of a loop), one after the other."""
     state = ChampionState()
-    for run in ("n1", "n2", "n3"):
-        state = put(state, run)
-    once = back(state)
-    assert present(once) == "n2" and present(back(once)) == "n1"
+    for step in steps.split():
+        loop, run = ("b", step[1:]) if step.startswith("b") else ("a", step)
+        if step.startswith("<"):
+            run, _, loop = step[1:].partition(":")
+            for name, former in champion.find_earlier(state, run, loop).items():
+                state = champion.promote(state, name, former, event="rolled back", when="by hand")
+        elif step.endswith("+"):  # with another reference
+            accepted = state.champions[loop]._replace(folder={"md5": step})
+            state = champion.promote(state, loop, accepted, event="drift accepted")
+        else:
+            first = Champion(run, run, "", {"md5": f"{loop} {run}"})
+            state = champion.promote(state, loop, first, event="promoted")
+    return " ".join(one.run for one in state.champions.values())
+
+
+@pytest.mark.parametrize(
+    ("steps", "production"),
+    [
+        ("n1 n2 n3 <", "n2"),
+        ("n1 n2 n3 < <", "n1"),
+        # after n4 was promoted in the place of n3, the one before it is n2
+        ("n1 n2 n3 < n4 <", "n2"),
+        ("n1 n2 n3 < n4 < <", "n1"),
+        # one that was left is put back by its name alone; before it is what it then replaced
+        ("n1 n2 n3 < n4 <n3", "n3"),
+        ("n1 n2 n3 < n4 <n3 <", "n4"),
+        ("n1 n2 n3 <n1 <n3", "n3"),
+        # the last promotions of all loops are taken back in their order
+        ("n1 bn1 bn2 n3 bn4 <", "n3 n2"),
+        ("n1 bn1 bn2 n3 bn4 < <", "n1 n2"),
+        ("n1 bn1 bn2 n3 bn4 < < <", "n1 n1"),
+        ("n1 bn1 bn2 n3 bn4 < < < n5 <:a", "n1 n1"),
+        # with an accepted drift it is the same champion
+        ("n1 n2 n2+ <", "n1"),
+    ],
+)
+def test_rollback_goes_back_the_way_that_production_came(steps, production):
+    assert play(steps) == production
+
+
+def test_before_the_first_champion_there_is_none():
     with pytest.raises(ValueError, match="expected an earlier champion to go back to, found none"):
-        back(back(once))
-    # after n4 was promoted in the place of n3, the one before it is n2
-    later = put(once, "n4")
-    assert present(back(later)) == "n2" and present(back(back(later))) == "n1"
-    # one that was left is put back by its name alone; before it is what it then replaced
-    again = back(later, "n3")
-    assert present(again) == "n3" and present(back(again)) == "n4"
-    assert present(back(back(state, "n1"), "n3")) == "n3"
-
-
-def test_rollback_takes_back_the_last_promotions_of_all_loops_in_their_order():
-    state = ChampionState()
-    for loop, run in (("a", "n1"), ("b", "n1"), ("b", "n2"), ("a", "n3"), ("b", "n4")):
-        state = put(state, run, loop)
-    course = []
-    for _ in range(3):
-        state = back(state)
-        course.append((present(state, "a"), present(state, "b")))
-    assert course == [("n3", "n2"), ("n1", "n2"), ("n1", "n1")]
-    assert present(back(put(state, "n5", "a"), loop="a"), "a") == "n1"
-
-
-def test_an_accepted_drift_is_the_same_champion_on_the_way_back():
-    state = put(put(ChampionState(), "n1"), "n2")
-    accepted = state.champions["toy"]._replace(folder={"md5": "with another reference"})
-    state = champion.promote(state, "toy", accepted, event="drift accepted")
-    assert present(back(state)) == "n1"
+        play("n1 n2 n3 < < <")
 
 
 # ---- what git or DVC keeps is left where it lies
