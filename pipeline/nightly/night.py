@@ -63,8 +63,8 @@ def preview() -> str:
     night = Night(last.night + 1, f"night-{last.night + 1:04d}", "")
     settings = _leave_out_loops(params.load(Nightly, "nightly"), copy.copy(last), night)
     _check(settings)
-    digests = inputs.contents(inputs.Hashes(last.hashes), _list_places(settings))
-    if _is_known(digests, last):
+    digests = inputs.contents(_list_places(settings), dict(last.hashes))
+    if inputs.digest(digests) == last.inputs and not last.unpushed:
         return "nightly, dry run: no recording, parameter or code has changed; a run would do nothing"
     _find_new(settings, last, digests, night)
     new = [path for paths in night.new_recordings.values() for path in paths]
@@ -123,8 +123,7 @@ def _work(settings: Nightly, last: Memory, memory: Memory, night: Night) -> None
         night.end(records.NOTHING_NEW, "section loops switches off every loop")
         return
     _check(settings)
-    folders = [loop.recordings for loop in settings.loops.values() if loop.recordings]
-    places = [*inputs.sources(), settings.holdout.recordings, *folders]
+    places = _list_places(settings)
     digests = inputs.contents(places, memory.hashes)
 
     def is_known() -> bool:
@@ -172,6 +171,12 @@ def _work(settings: Nightly, last: Memory, memory: Memory, night: Night) -> None
 
 
 # ---- before the stages
+
+
+def _list_places(settings: Nightly) -> list[str]:
+    """What a night reads."""
+    folders = [loop.recordings for loop in settings.loops.values() if loop.recordings]
+    return [*inputs.sources(), settings.holdout.recordings, *folders]
 
 
 def _leave_out_loops(settings: Nightly, memory: Memory, night: Night) -> Nightly:
