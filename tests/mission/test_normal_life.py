@@ -11,7 +11,11 @@ from tests.foreign import normal_life
 
 HOURS = 50.0
 
-pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="the exported C needs gcc")
+# minutes: a controller is learned from two recordings, and plays 50 hours
+pytestmark = [
+    pytest.mark.full,
+    pytest.mark.skipif(shutil.which("gcc") is None, reason="the exported C needs gcc"),
+]
 
 
 @pytest.fixture(scope="module")

@@ -160,6 +160,7 @@ def fan_dip_degC(folder: Path, name: str, *, told: bool) -> float:
     return max(errors)
 
 
+@pytest.mark.full
 def test_a_fan_that_is_told_is_made_up_for_on_the_machine(disturbed_project, tmp_path):
     folder = shutil.copytree(disturbed_project, tmp_path / "copy", symlinks=True)
     learned = metrics(folder, "learn_kernel")["forward"][FAN]["heater_1"]
