@@ -130,7 +130,7 @@ import time
 def main(arguments):
     print("works", flush=True)
     try:
-        time.sleep(600)
+        time.sleep(90)
     except KeyboardInterrupt:
         time.sleep(0.3)
         print("interrupted", flush=True)
@@ -149,7 +149,7 @@ def main(arguments):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
 @pytest.mark.skipif(sys.platform != "linux", reason="prctl is Linux's")
 def test_no_dvc_outlives_run(copy, number):
-    tells = "import os, time\ndef main(arguments):\n    print(os.getpid(), flush=True)\n    time.sleep(600)\n"
+    tells = "import os, time\ndef main(arguments):\n    print(os.getpid(), flush=True)\n    time.sleep(90)\n"
     with start(copy, tells) as started:
         assert started.stdout is not None
         pids = [int(started.stdout.readline().split(": ")[1]) for _ in ENDS]
