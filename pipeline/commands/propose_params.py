@@ -103,7 +103,7 @@ def proposed(paths: Sequence[Path], *, sample_time: str = "") -> Initialised:
         if not any(signal.role == role for signal in proposal.signals):
             raise ValueError(
                 f"{paths[0]}: nothing in it looks like {word}, without which no plant can be identified; "
-                "where it was not recorded, record it; where it was, name its column so (heater_1_pct, "
+                "if it was not recorded, record it; if it was, name its column so (heater_1_pct, "
                 "zone_1_C), or write ingest.mapping and plant in params.yaml by hand"
             )
     for path, recording in zip(paths, recordings, strict=True):

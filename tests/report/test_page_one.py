@@ -175,6 +175,13 @@ def test_the_deciding_picture_draws_the_recorded_run_to_its_last_value(reports, 
         assert any(float(listed[shown]) == pytest.approx(end, rel=0.06) for end in ends), (listed, ends)
 
 
+def test_the_deciding_picture_draws_whom_the_table_beside_it_shows(cards):
+    card = cards["temperature"]
+    listed = re.findall(r"\d ([A-Za-z+, ]+?) \d[\d.]*[,.]", card[card.index("ends off its reference") :])
+    heads = card[: card.index("Settled error")]
+    assert len(listed) == 3 and all(name in heads for name in listed), (listed, heads)
+
+
 def test_what_changed_is_counted_for_every_loop(first):
     place = first.text[first.text.index("Since the") :]
     assert "First run: nothing to compare with." in place

@@ -9,21 +9,17 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.card import PICTURE, Card, Deciding, cell, entrant, in_order, of_verdict, step
+from pipeline.report.shared.card import PICTURE, Card, Deciding, cell, entrant, of_verdict, step
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature.judgement import Judgement, named_before
-from pipeline.report.temperature.pictures import runs_of, until_settled
-from pipeline.temperature.controllers.table import BY_NAME
+from pipeline.report.temperature.judgement import Judgement
+from pipeline.report.temperature.pictures import IDLE, contestants, runs_of, until_settled
 from pipeline.verdict.controllers import heading
 from pipeline.verdict.digits import THIN, count, short
 from pipeline.verdict.evidence import Table, entry, gap_of, need, need_figure, or_gap, or_nothing
-from pipeline.verdict.pairs import pair_names
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, Verdict, state
 from pipeline.verdict.wording import OFF_THE_SCALE, banded, limit_text, places_of, worded
 
 MOVES = "Heaters and motor to barrel temperatures"
-# the baseline that stands beside the pair if nobody runs yet
-PI, IDLE = ("pi_simc", "pi"), "hold"
 # the first two figures of the card; the third is the one that decides, else overshoot
 FIGURES = ("settled_error", "settling")
 NOT_JUDGED = Missing(OPEN, "It was not judged")
@@ -50,17 +46,6 @@ def card(sources: Sources, judged: Judgement, verdict: Verdict) -> Card:
         sources=sources.source("evaluate_temperature"),
         missing=gap.sentence() if gap else "",
     )
-
-
-def contestants(sources: Sources, judged: Judgement) -> dict[str, str]:
-    """Whom the card shows, and what each is here: the pair, the one that the verdict is about, and what runs
-    now or a PI if there is room."""
-    runs = named_before(sources)
-    champion = runs if isinstance(sources.nightly, dict) else ""
-    wanted = [judged.subject, *pair_names(sources.metrics), *([runs] if runs else []), *PI, IDLE]
-    there = [name for name in dict.fromkeys(wanted) if name == judged.subject or judged.answers.get(name)]
-    kinds = {name: BY_NAME[name].kind if name in BY_NAME else "" for name in there[:3]}
-    return in_order(kinds, champion)
 
 
 @or_nothing
@@ -147,7 +132,7 @@ def deciding(
         who: float(np.abs(table[zone] - table[f"{zone}_reference"])[rows[-1]]) for who, rows in runs.items()
     }
     listed = ", ".join(f"{i} {heading(who)} {short(end, 2)}" for i, (who, end) in enumerate(ends.items(), 1))
-    finding = f"{lead}{label[:1].upper()}{label[1:]} ends off its reference by, in °C: {listed}."
+    finding = f"{lead}In °C, {label} ends off its reference by: {listed}."
     finding = f"{finding} Grey: the limit."
     return Deciding(
         finding,

@@ -9,9 +9,10 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
+from pipeline.report.shared.card import in_order
 from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature.judgement import Judgement
+from pipeline.report.temperature.judgement import Judgement, named_before
 from pipeline.temperature.tables import set_point_of
 from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading, in_a_sentence, kind
 from pipeline.verdict.digits import THIN, count, number, short
@@ -20,14 +21,28 @@ from pipeline.verdict.pairs import curve_sentence, pair_names, reference_of
 from pipeline.verdict.temperature import comparison, names, refused
 from pipeline.verdict.verdict import UNJUDGED, Missing
 
+# the baseline that stands beside the pair if nobody runs yet
+PI, IDLE = ("pi_simc", "pi"), "hold"
+
 CASES = {"typical": "A typical case", "deciding": "The case that decides"}
 # a cost or temperature beyond it is of a loop that is lost; it is drawn at the edge
 LARGEST = 1e4
 
 
+def contestants(sources: Sources, judged: Judgement) -> dict[str, str]:
+    """Whom the card shows, and what each is here: the pair, the one that the verdict is about, and what runs
+    now or a PI if there is room."""
+    runs = named_before(sources)
+    champion = runs if isinstance(sources.nightly, dict) else ""
+    wanted = [judged.subject, *pair_names(sources.metrics), *([runs] if runs else []), *PI, IDLE]
+    there = [name for name in dict.fromkeys(wanted) if name == judged.subject or judged.answers.get(name)]
+    kinds = {name: BY_NAME[name].kind if name in BY_NAME else "" for name in there[:3]}
+    return in_order(kinds, champion)
+
+
 def list_drawn(sources: Sources, judgement: Judgement) -> list[str]:
-    """Who is drawn: the pair, the best, and PI, in the order of simplicity."""
-    wanted = {*pair_names(sources.metrics), judgement.subject, "pi"}
+    """Who is drawn: the contestants of page one, in the order of simplicity."""
+    wanted = contestants(sources, judgement)
     return [name for name in (*names(sources.metrics), *refused(sources.metrics)) if name in wanted]
 
 
