@@ -19,7 +19,6 @@ import pytest
 import yaml
 
 from pipeline import cli
-from pipeline.recordings import isolated
 from pipeline.setpoint.agents import score
 from pipeline.store import artifacts
 from tests import readme
@@ -92,8 +91,6 @@ def beadline(monkeypatch, capsys):
 
     def run(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr("sys.argv", ["beadline", *arguments])
-        # a command has children of its own, in its own folder
-        monkeypatch.setattr(isolated, "_waiting", [])
         status = 0
         try:
             cli.main()

@@ -128,8 +128,8 @@ def test_an_interrupt_reaches_every_loop_once(copy):
     counts = """
 import time
 def main(arguments):
-    print("works", flush=True)
     try:
+        print("works", flush=True)
         time.sleep(90)
     except KeyboardInterrupt:
         time.sleep(0.3)

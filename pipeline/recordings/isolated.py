@@ -1,8 +1,8 @@
 """Work on a stranger's file, done in a warm child process within a budget of time and memory.
 
-A child serves one call after the other. A call that runs out of its budget, or that ends the process, costs
-that call alone: the next one gets a fresh child. Calls go to the child pickled, as they are ours. Results
-come back as JSON, so that nothing a file did to the child runs here.
+A child serves one call after the other, each in the folder of its caller. A call that runs out of its budget,
+or that ends the process, costs that call alone: the next one gets a fresh child. Calls go to the child
+pickled, as they are ours. Results come back as JSON, so that nothing a file did to the child runs here.
 """
 
 import contextlib
@@ -56,7 +56,7 @@ def isolated(work: Callable[..., Any], *arguments: Any, shown: str | Path, budge
     call takes longer or needs more memory than its budget, or ends the process.
     """
     child = _take()
-    call = pickle.dumps((budget, work, arguments))
+    call = pickle.dumps((os.getcwd(), budget, work, arguments))
     reply: dict[str, Any] = {}
     try:
         pipe_in, pipe_out = child.process.stdin, child.process.stdout
@@ -163,7 +163,8 @@ def serve() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     ready = True
     while ready and len(head := calls.read(_LENGTH.size)) == _LENGTH.size:
-        budget, work, arguments = pickle.loads(calls.read(_LENGTH.unpack(head)[0]))
+        folder, budget, work, arguments = pickle.loads(calls.read(_LENGTH.unpack(head)[0]))
+        os.chdir(folder)
         ready = _answer(replies, budget, work, arguments)
 
 

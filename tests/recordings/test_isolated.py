@@ -40,6 +40,14 @@ def test_one_child_serves_call_after_call():
     assert len({isolated(os.getpid, shown="x", budget=BUDGET) for _ in range(5)}) == 1
 
 
+def test_a_warm_child_works_in_the_folder_of_its_caller(tmp_path, monkeypatch):
+    """A night measures the same names in the project and in its copy."""
+    for name in ("project", "copy"):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)
+        assert isolated(os.getcwd, shown="x", budget=BUDGET) == str(tmp_path / name)
+
+
 def test_what_a_call_prints_is_no_reply(capfd):
     assert isolated(os.system, "echo hello", shown="x", budget=BUDGET) == 0
     assert capfd.readouterr().out == ""

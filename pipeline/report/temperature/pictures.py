@@ -41,8 +41,8 @@ def contestants(sources: Sources, judged: Judgement) -> dict[str, str]:
 
 
 def list_drawn(sources: Sources, judgement: Judgement) -> list[str]:
-    """Who is drawn: the contestants of page one, in the order of simplicity."""
-    wanted = contestants(sources, judgement)
+    """Who has a column of a case: the pair, the best, and PI, in the order of simplicity."""
+    wanted = {*pair_names(sources.metrics), judgement.subject, "pi"}
     return [name for name in (*names(sources.metrics), *refused(sources.metrics)) if name in wanted]
 
 
@@ -366,21 +366,23 @@ def record_length(sources: Sources) -> Picture:
 
 
 def runs_of(sources: Sources, judged: Judgement, table: Table) -> tuple[dict[str, np.ndarray], str]:
-    """Rows of the deciding case under everybody whom the temperature page draws, and the output that the
-    subject of the verdict leaves furthest from its reference."""
+    """Rows of the deciding case under those whom page one's table shows, in the order of simplicity, and the
+    output that the subject of the verdict leaves furthest from its reference."""
+    shown = contestants(sources, judged)
     runs = {
         who: np.flatnonzero((table["contestant"] == who) & (table["case_name"] == "deciding"))
-        for who in list_drawn(sources, judged)
+        for who in names(sources.metrics)
+        if who in shown
     }
     runs = {who: rows for who, rows in runs.items() if len(rows)}
-    names = [output.name for output in sources.declared.machine.outputs]
+    outputs = [output.name for output in sources.declared.machine.outputs]
     if not runs:
-        return {}, names[0]
+        return {}, outputs[0]
     rows = runs.get(judged.subject, next(iter(runs.values())))
     settled = entry(comparison(sources.metrics), "settled_steps")
     last = rows[-(settled if isinstance(settled, int) else max(len(rows) // 10, 1)) :]
-    apart = [float(np.abs(np.mean(table[name][last] - table[f"{name}_reference"][last]))) for name in names]
-    return runs, names[int(np.argmax(np.nan_to_num(apart, nan=np.inf)))]
+    apart = [float(np.abs(np.mean(table[name][last] - table[f"{name}_reference"][last]))) for name in outputs]
+    return runs, outputs[int(np.argmax(np.nan_to_num(apart, nan=np.inf)))]
 
 
 def until_settled(table: Table, runs: dict[str, np.ndarray], zone: str) -> float:
