@@ -229,10 +229,11 @@ def record(
     """A record ready to be asked. Raises ValueError where it is too short."""
     n, p = machine.plant.n, machine.plant.p
     long = [(u, y) for u, y in segments if len(y) >= 4 * n + 8]
-    if (samples := sum(len(y) for _, y in long)) < SHORTEST:
+    measured = sum(int(np.isfinite(y).any(axis=1).sum()) for _, y in long)
+    if measured < SHORTEST:
         raise ValueError(
-            f"drift: expected records of at least {SHORTEST} samples to hold against the champion, "
-            f"found {samples}; record longer"
+            f"drift: expected records of at least {SHORTEST} samples to hold against the champion, with "
+            f"readings that are not masked, found {measured}; record longer"
         )
     scale, none = _in(scale, room), np.zeros((0, 0))
     bare = DriftRecord(machine, scale, machine.gain(room.draught, scale.variance), [], none, none)

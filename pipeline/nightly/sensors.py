@@ -5,6 +5,9 @@ The supervisor's forecasts last 36 samples, in which a slow zone hardly moves. A
 so it is asked again with samples 4 and 16 times as far apart: the model over s samples is
 
     x(t+s) = A^s x(t) + (I + A + ... + A^(s-1)) (B u + b),    u the mean of the inputs meanwhile
+
+While a good loop holds a zone, the model foretells no move that could be missing. A sensor whose noise is not
+small beside its step then still turns back every few samples, and one that is stuck does not.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,6 +28,8 @@ GONE = 30  # samples without a number that an honest log may have, all together
 ON = 0.01  # share of a heater's range that is given by one that is on
 LASTS = 60  # samples for which a sensor stays in doubt: one that only seems to stand still soon moves again
 SHARE = 1 / 3  # of a record, if it is not in doubt to the end: a good loop holds a coarse sensor still
+RESTLESS = 0.15  # share of samples at which a sensor turns back, whose noise is a quarter of its step or more
+MISSING = 30.0  # reversals that a sensor that turns back so often owes, before it is said to be stuck
 
 
 class SensorFault(NamedTuple):
@@ -42,17 +47,34 @@ class SensorFault(NamedTuple):
         return self.kind, self.sample
 
 
-def steps(records: Sequence[Segments]) -> np.ndarray:
-    """The smallest change (p,) of each sensor in honest records, in °C; a large one if it never moved."""
+def smallest_changes(records: Sequence[Segments], unmoved: float = supervise.MOST_STEP_DEGC) -> np.ndarray:
+    """The smallest change (p,) of each sensor in records, in °C; `unmoved` if there is none."""
     moves = np.concatenate([np.abs(np.diff(y, axis=0)) for record in records for _, y in record])
-    return np.where(moves > 1e-9, moves, supervise.MOST_STEP_DEGC).min(axis=0)
+    least = np.where(moves > 1e-9, moves, np.inf).min(axis=0)
+    return np.where(np.isfinite(least), least, unmoved)
+
+
+def reversals(records: Sequence[Segments]) -> np.ndarray:
+    """The share (p,) of samples of honest records at which each sensor turns back after one sample: it is
+    low for a sensor whose noise is small beside its step."""
+    turns = np.concatenate([
+        np.diff(y[:-1], axis=0) * np.diff(y[1:], axis=0) < 0 for record in records for _, y in record
+    ])  # fmt: skip
+    return turns.mean(axis=0)
 
 
 def faults(
-    model: Plant, machine: Machine, segments: Segments, *, noise: np.ndarray, steps: np.ndarray
+    model: Plant,
+    machine: Machine,
+    segments: Segments,
+    *,
+    noise: np.ndarray,
+    steps: np.ndarray,
+    reversals: np.ndarray,
 ) -> list[SensorFault]:
     """The sensors that are in doubt in a record of inputs u (T, m) and readings y (T, p), masked ones too, by
-    the machine's model, the noise (p,) and the steps (p,) of its sensors in °C; the surest first."""
+    the machine's model, and by noise (p,) and steps (p,) of its sensors in °C and their share of reversals
+    (p,) in honest records; the surest first."""
     wired = supervise.Machine(
         tuple(Signal(one.name, supervise.PERCENT, one.low, one.high) for one in machine.inputs),
         tuple(
@@ -66,7 +88,12 @@ def faults(
         ),
         machine.sample_time_s,
     )
-    found: dict[str, SensorFault] = {}
+    supervision = assembly.supervision(strictly_proper(model), wired, noise)
+    # a logger may round to coarser steps from tonight on, in which a healthy sensor turns back less often
+    tonight = np.minimum(smallest_changes([segments], 0.0), supervise.MOST_STEP_DEGC)
+    often = np.where(tonight > 2 * np.maximum(steps, noise), 0.0, reversals)
+    steps = np.maximum(steps, tonight)
+    found = {fault.output: fault for fault in _find_stuck(supervision, wired, segments, often)}
     for spacing in SPACINGS:
         rarer = wired._replace(sample_time_s=spacing * wired.sample_time_s)
         s = assembly.supervision(_rarer(strictly_proper(model), spacing), rarer, noise)
@@ -74,6 +101,31 @@ def faults(
             before = found.get(fault.output, fault)
             found[fault.output] = min(before, fault, key=lambda one: one.rank)
     return sorted(found.values(), key=lambda one: one.rank)
+
+
+def _find_stuck(
+    s: Supervision, machine: supervise.Machine, segments: Segments, reversals: np.ndarray
+) -> Iterator[SensorFault]:
+    """Every sensor that gives one and the same reading for a third of the record while its heater is on, and
+    that should have turned back many times meanwhile."""
+    begin, samples = 0, sum(len(y) for _, y in segments)
+    for u, y in segments:
+        for i in np.flatnonzero(reversals >= RESTLESS):
+            heater = _heater_of(s, int(i))
+            ends = np.flatnonzero(np.diff(y[:, i], append=np.nan) != 0) + 1
+            starts = np.r_[0, ends[:-1]]
+            first, last = max(zip(starts, ends, strict=True), key=lambda run: run[1] - run[0])
+            enough = int(np.ceil(max(SHARE * samples, LASTS, MISSING / reversals[i])))
+            given = u[first:last, heater].mean() - s.low[heater]
+            if last - first >= enough and given > ON * (s.high - s.low)[heater]:
+                words = _sentence(s, machine, STILL, int(i), y[first, i])
+                yield SensorFault(machine.outputs[i].name, STILL, words, begin + first + enough)
+        begin += len(y)
+
+
+def _heater_of(s: Supervision, output: int) -> int:
+    """The input that an output answers to most."""
+    return int(s.input_of[int((s.of_input == output).argmax())])
 
 
 def _rarer(model: Plant, spacing: int) -> Plant:
@@ -92,7 +144,7 @@ def _follow(
     """Every sensor in doubt, once."""
     silent, told, begin = np.zeros(len(s.d), int), set(), 0
     last = sum(len(y) for _, y in segments) - 1
-    heaters = s.input_of[[int((s.of_input == i).argmax()) for i in range(len(s.d))]]
+    heaters = [_heater_of(s, i) for i in range(len(s.d))]
     for u, y in segments:
         k, doubtful = supervise.kept(s), np.zeros((len(KINDS), len(s.d)), int)
         unfounded = doubtful > 0
@@ -124,5 +176,5 @@ def _follow(
 def _sentence(s: Supervision, machine: supervise.Machine, kind: int, i: int, reading: float) -> str:
     if kind == OPEN:
         return supervise.sentence(s, machine, OPEN, i, reading)
-    heater = machine.inputs[s.input_of[int((s.of_input == i).argmax())]].name
+    heater = machine.inputs[_heater_of(s, i)].name
     return f"{machine.outputs[i].name} stands still at {reading:.1f} °C while {heater} heats."

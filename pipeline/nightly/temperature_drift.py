@@ -63,14 +63,16 @@ SENTENCES = {
 
 
 class ProductionReference(NamedTuple):
-    """What the champion's own recordings said of its model, and their closed-loop figures; `steps` (p,) are
-    those of the sensors in °C. `digest` is that of reference.json, by which the memory of the nights knows it
-    again. Then the machine as it is declared, and the limits that changes are held against."""
+    """What the champion's own recordings said of its model, and their closed-loop figures. Of the sensors:
+    `steps` (p,) in °C, and `reversals` (p,), the share of samples at which each turns back. `digest` is that
+    of reference.json, by which the memory of the nights knows it again. Then the machine as it is declared,
+    and the limits that changes are held against."""
 
     machine: ProductionModel
     own: Baseline
     loop: list[dict[str, list[list[float]]]]
     steps: np.ndarray
+    reversals: np.ndarray
     digest: str
     plant: Plant
     limits: DriftLimits
@@ -130,7 +132,8 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
         "samples": samples,
         "own": own.to_json(),
         "loop": [_closed_loop(one, machine) for one in kept],
-        "steps": sensors.steps(nights).tolist(),
+        "steps": sensors.smallest_changes(nights).tolist(),
+        "reversals": sensors.reversals(nights).tolist(),
     }
 
 
@@ -165,6 +168,7 @@ def read_reference(folder: Path, machine: Plant, limits: DriftLimits) -> Product
         Baseline.read(own),
         fields["loop"],
         np.array(fields.get("steps", [np.inf] * model.plant.p)),
+        np.array(fields.get("reversals", [0.0] * model.plant.p)),
         artifacts.sha256(path),
         machine,
         limits,
@@ -238,7 +242,14 @@ def _stand_still(
 
     def find_faults(segments: Segments) -> list[sensors.SensorFault]:
         model = production.machine.plant
-        return sensors.faults(model, production.plant, segments, noise=noise, steps=production.steps)
+        return sensors.faults(
+            model,
+            production.plant,
+            segments,
+            noise=noise,
+            steps=production.steps,
+            reversals=production.reversals,
+        )
 
     faults = find_faults(readings)
     if not faults:

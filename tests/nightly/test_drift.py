@@ -254,7 +254,8 @@ def test_gaps_in_the_outputs_are_passed_over(machine, own):
 def test_a_record_too_short_to_judge_is_refused(machine, own):
     with pytest.raises(
         ValueError,
-        match="expected records of at least 96 samples to hold against the champion, found 60; record longer",
+        match="expected records of at least 96 samples to hold against the champion, with "
+        "readings that are not masked, found 60; record longer",
     ):
         explained(machine, own, record(two_zones(), 8, samples=60))
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.nightly import drift, inputs, judge, screening, temperature_drift
+from pipeline.nightly import drift, inputs, judge, screening, sensors, temperature_drift
 from pipeline.nightly.records import SENSOR, Alarm, Memory, NightDrift, from_json, to_json
 from pipeline.nightly.settings import Nightly
 from pipeline.recordings import plain_files
@@ -461,6 +461,42 @@ def test_a_coarse_sensor_that_a_good_loop_holds_still_and_that_moves_again_is_no
     still = shift["sensor_2"].copy()
     still[200:330] = still[200]
     assert [a for a in look(shift | {"sensor_2": still}).drift.alarms if a.kind == SENSOR] == []
+
+
+def held(step_degC: float, rounds: np.ndarray) -> dict[str, np.ndarray]:
+    """A shift whose loop holds both zones, with nothing that moves them; sensors in steps of so many °C."""
+    shift = nights.a_night(1, 750, loop={"dither": 0.0})
+    return shift | {
+        name: np.round((shift[name] + rounds) / step_degC) * step_degC for name in ("sensor_1", "sensor_2")
+    }
+
+
+def test_a_sensor_that_is_stuck_while_the_loop_holds_its_zone_is_an_alarm(look, monkeypatch):
+    """The model foretells no move that could be missing; the noise of the sensor is."""
+    good = held(1e-4, np.zeros(600))
+    assert [a for a in look(good).drift.alarms if a.kind == SENSOR] == []
+    stuck = good | {"sensor_2": np.r_[good["sensor_2"][:300], np.full(300, 110.0)]}
+    alarm = look(stuck).drift.alarms[0]
+    assert (alarm.kind, alarm.channel) == (SENSOR, "sensor_2")
+    assert alarm.cause.startswith("sensor_2 stands still at 110.0 °C while heater_2 heats.")
+    off = stuck | {"heater_2": np.zeros(600)}
+    assert not any("sensor_2 stands still" in a.cause for a in look(off).drift.alarms)
+    monkeypatch.setattr("pipeline.nightly.sensors.MISSING", 1e9)
+    assert [a for a in look(stuck).drift.alarms if a.kind == SENSOR] == []
+
+
+def test_a_sensor_that_is_rounded_to_a_degree_from_tonight_on_is_not_stuck(look):
+    rounded = held(1.0, np.r_[np.tile([0.5, -0.5], 50), np.zeros(500)])
+    assert len(set(rounded["sensor_2"][120:])) == 1
+    assert [a for a in look(rounded).drift.alarms if a.kind == SENSOR] == []
+
+
+def test_a_sensor_whose_noise_is_small_beside_its_step_owes_no_reversals():
+    rng = np.random.default_rng(3)
+    course = 200 + np.cumsum(0.02 * rng.standard_normal(20000))
+    of = [sensors.reversals([[(course, q * np.round(course[:, None] / q + noise))]])[0]
+          for q, noise in ((0.25, 0.0), (0.1, 0.5 * rng.standard_normal((20000, 1))))]  # fmt: skip
+    assert of[0] < sensors.RESTLESS < of[1]
 
 
 def test_good_shifts_with_coarse_sensors_are_no_dead_sensors(look):
