@@ -173,6 +173,22 @@ def balance_changes(
     return [CameraChange("balance", words, float(balance.sigmas[k]))]
 
 
+def foreign_changes(
+    now: np.ndarray, before: np.ndarray, *, together: float, points: float
+) -> list[CameraChange]:
+    """Of counts (2,) of frames that look like what the classifier learned from, and of those that do not,
+    against the prints before (prints, 2): more of these by at least `points`. No label is asked. How sure
+    the classifier is of its classes says nothing: of frames out of focus it is surer, and wrong."""
+    share = class_balance(now, before, together=together)
+    if share.value[1] - share.reference[1] < points:
+        return []
+    words = (
+        f"{share.value[1]:.0f} % of the frames look like none that the classifier learned from, where "
+        f"{share.reference[1]:.0f} % were usual: focus, the nozzle's tip in the picture, or another camera"
+    )
+    return [CameraChange("foreign frames", words, float(share.sigmas[1]))]
+
+
 def class_balance(now: np.ndarray, before: np.ndarray, *, together: float) -> Shift:
     """Shares of classes in counts now (classes,) against those of good nights (nights, classes), in points;
     frames come in runs of `together` that say the same."""

@@ -3,7 +3,7 @@ and what of all that has changed is an alarm."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,7 @@ FRAMES = 40  # pictures of a recording that are looked at
 
 def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[Any]]:
     """[median, deviation] of each of the last `most` trials below `folder` whose pictures show a bead; `only`
-    those named."""
+    those named if any are."""
     rows, camera = [], _camera()
     trials = readable(sorted(folder.rglob("*.mcap")), folder)
     paths = [path for path in trials if not only or path.as_posix() in only]
@@ -91,10 +91,23 @@ def find_trials_drift(
 # ---- setpoint: the camera that looks at the nozzle
 
 
-def of_prints(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[Any]]:
-    """Of each of the last `most` prints below `folder`, `only` those named: name, frames by class and without
-    a line (4,), frames of a segment, the line's median contrast and its deviation, as reference.json keeps
-    them."""
+class NightPrint(NamedTuple):
+    """Of a print's frames, as reference.json keeps them: name; those of each class and without a line (4,);
+    frames of a segment; the line's median contrast and its deviation, nothing if no frame shows a line; those
+    that look like what the champion's classifier learned from, and those that do not (2,), 0 if that is not
+    known."""
+
+    name: str
+    counts: list[int]
+    together: float
+    contrast: list[float]
+    deviation: list[float]
+    familiar: Sequence[int] = (0, 0)
+
+
+def of_prints(folder: Path, champion: Path, most: int, only: Sequence[str] = ()) -> list[NightPrint]:
+    """The last `most` prints below `folder`, `only` those named if any are, as the classifier below
+    `champion` sees them."""
     from pipeline.setpoint.recordings import read_options
     from pipeline.setpoint.settings import SetpointMaterial
 
@@ -104,18 +117,41 @@ def of_prints(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
     frames = nozzle_frames.read_folder(
         folder, read_options(settings, material), params.load(params.Execution, "execution")
     )
+    distance, above = _foreignness(frames, champion)
     rows = []
     numbered = [(number, name) for number, name in enumerate(frames.prints) if not only or name in only]
     for number, name in numbered[-most:]:
         here = frames.print_number == number
-        good = here & frames.valid & (frames.label >= 0)
-        if good.any():
-            classes = np.bincount(frames.label[good], minlength=3).tolist()
-            counts = [*classes, int((here & ~frames.valid).sum())]
-            together = float(here.sum() / len(np.unique(frames.segment[here])))
-            contrast = camera_drift.line_contrast(frames.score[good], together=together)
-            rows.append([name, counts, together, *(part.tolist() for part in contrast)])
+        seen = here & frames.valid
+        classes = np.bincount(frames.label[seen], minlength=3).tolist()
+        together = float(here.sum() / len(np.unique(frames.segment[here])))
+        contrast: tuple[np.ndarray, np.ndarray] = np.zeros(0), np.zeros(0)
+        if seen.any():
+            contrast = camera_drift.line_contrast(frames.score[seen], together=together)
+        asked = distance[seen & np.isfinite(distance)]
+        rows.append(
+            NightPrint(
+                name,
+                [*classes, int((here & ~frames.valid).sum())],
+                together,
+                *(part.tolist() for part in contrast),
+                [int((asked <= above).sum()), int((asked > above).sum())],
+            )
+        )
     return rows
+
+
+def _foreignness(frames: nozzle_frames.NozzleFrames, champion: Path) -> tuple[np.ndarray, float]:
+    """How far each frame (n,) is from what the champion's classifier learned from, NaN if that is not known,
+    and beyond what it is foreign."""
+    files = [champion / f"train_classifier/{name}" for name in ("weights.safetensors", "calibration.parquet")]
+    if not all(file.exists() for file in files):
+        return np.full(len(frames.valid), np.nan), np.inf
+    from pipeline.setpoint.vision.files import restore_classifier
+    from pipeline.setpoint.vision.gallery import classified_frames
+
+    model = restore_classifier(*map(str, files))
+    return classified_frames(model, frames)[1], model.calibration.foreign_above
 
 
 def _classifier() -> "TrainClassifier | None":
@@ -132,12 +168,13 @@ def find_prints_drift(
     loop: str,
     folder: str,
     paths: Sequence[str],
+    champion: Path,
     reference: Sequence[Sequence[Any]],
     pending: Collection[str],
 ) -> None:
     """Adds what the new prints `paths` in the loop's folder of recordings say. A file that cannot be read is
-    set aside. Classes, frames without a line, and the line's contrast are compared with the prints of
-    `reference`."""
+    set aside. Classes, frames without a line, those that are foreign to the classifier below `champion`, and
+    the line's contrast are compared with the prints of `reference`."""
     if not (settings := _classifier()):
         return
     for path in paths:
@@ -145,23 +182,32 @@ def find_prints_drift(
             drift.quarantined[path] = quarantine(path, loop, reason)
     if not reference:
         return
-    names = {row[0] for row in reference}
-    usual = np.array([row[1] for row in reference])
-    contrasts = [(np.array(row[3]), np.array(row[4])) for row in reference]
+    before = [NightPrint(*row) for row in reference]
+    names = {one.name for one in before}
     try:
-        prints = [row for row in of_prints(Path(folder), 10**6) if row[0] not in names]
+        prints = [one for one in of_prints(Path(folder), champion, 10**6) if one.name not in names]
     except ValueError as error:  # what the stage will refuse as well, and say so
         drift.notes.append(str(error))
         return
-    for name, counts, together, middle, deviation in prints:
-        contrast = np.array(middle), np.array(deviation)
-        causes = [
-            *camera_drift.balance_changes(
-                np.array(counts), usual, together=together, points=limits.balance_points
-            ),
-            *camera_drift.contrast_changes(contrast, contrasts, percent=limits.contrast_percent),
-        ]
-        add_alarms(drift, limits, loop, name, causes, pending)
+    for one in prints:
+        add_alarms(drift, limits, loop, one.name, _print_changes(one, before, limits), pending)
+
+
+def _print_changes(
+    one: NightPrint, before: Sequence[NightPrint], limits: DriftLimits
+) -> list[camera_drift.CameraChange]:
+    """What a print's frames say against those of the prints before."""
+    points, usual = limits.balance_points, np.array([other.counts for other in before])
+    causes = camera_drift.balance_changes(np.array(one.counts), usual, together=one.together, points=points)
+    known = np.array([other.familiar for other in before if sum(other.familiar)])
+    if sum(one.familiar) and len(known):
+        familiar = np.array(one.familiar)
+        causes += camera_drift.foreign_changes(familiar, known, together=one.together, points=points)
+    contrasts = [(np.array(other.contrast), np.array(other.deviation)) for other in before if other.contrast]
+    if one.contrast and contrasts:
+        contrast = np.array(one.contrast), np.array(one.deviation)
+        causes += camera_drift.contrast_changes(contrast, contrasts, percent=limits.contrast_percent)
+    return causes
 
 
 def _unreadable(path: str, settings: "TrainClassifier") -> str:

@@ -34,7 +34,7 @@ def look(
             pictures.find_trials_drift(drift, limits, name, paths, _read(own), memory.pending)
         elif loop.judge == "setpoint":
             pictures.find_prints_drift(
-                drift, limits, name, loop.recordings, paths, _read(own), memory.pending
+                drift, limits, name, loop.recordings, paths, own, _read(own), memory.pending
             )
         # what each loop recorded since its alarm: a person may accept that as how things are
         raised = [a.recording for a in drift.alarms if a.loop == name and a.kind != SENSOR]
@@ -53,8 +53,12 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
     if not loop.recordings or not Path(loop.recordings).is_dir():
         return None
     if loop.judge in ("deposition", "setpoint"):
-        figures_of = {"deposition": pictures.of_trials, "setpoint": pictures.of_prints}[loop.judge]
-        rows = figures_of(Path(loop.recordings), temperature_drift.NIGHTS, only)
+        recordings, most = Path(loop.recordings), temperature_drift.NIGHTS
+        rows = (
+            pictures.of_trials(recordings, most, only)
+            if loop.judge == "deposition"
+            else pictures.of_prints(recordings, folder, most, only)
+        )
         return {"schema": "reference", "version": 1, "camera": rows} if rows else None
     if loop.judge != "temperature" or not _learns_from(loop):
         return None

@@ -1,11 +1,25 @@
 """What a camera's pictures tell of themselves: moved, other light, other ink,
 out of focus; and nothing where nothing changed."""
 
+import shutil
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
+import yaml
 
 from pipeline.deposition.camera import rendering
-from pipeline.nightly import camera_drift
+from pipeline.nightly import camera_drift, pictures, screening
+from pipeline.nightly.records import NightDrift
+from pipeline.nightly.settings import Nightly
+from pipeline.setpoint.recordings import read_frames
+from pipeline.setpoint.settings import TrainClassifier
+from pipeline.setpoint.vision import own_pictures
+from pipeline.setpoint.vision.files import restore_network, store_classifier
+from pipeline.store import params
+from stages.train_classifier import SHIPPED
+from tests.foreign import nozzle_pictures
 
 LIMITS = {"moved_px": 2.0, "contrast_percent": 15.0}
 
@@ -112,3 +126,94 @@ def test_a_line_that_stands_out_less_is_named():
     assert camera_drift.contrast_changes(prints(80, [1, 0, 0, 0], 40.0)[1], before, percent=15.0) == []
     causes = camera_drift.contrast_changes(prints(81, [1, 0, 0, 0], 25.0)[1], before, percent=15.0)
     assert [cause.key for cause in causes] == ["contrast"] and causes[0].sigmas < -5
+
+
+# ---- prints of a nozzle's camera
+
+PRINTS = Path("datasets/raw/setpoint")
+
+
+@pytest.fixture(scope="module")
+def camera(root, tmp_path_factory):
+    """A project with six prints of a foreign camera, the classifier that learned from them, and what they say
+    of it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("camera"))
+        for name in ("params.yaml", "params.expert.yaml"):
+            shutil.copy(root / name, name)
+        parameters = yaml.safe_load(Path("params.yaml").read_text())
+        parameters["train_classifier"]["source"] = "recordings"
+        Path("params.yaml").write_text(yaml.safe_dump(parameters))
+        rng = np.random.default_rng(5)
+        nozzle_pictures.write_prints(PRINTS, 6, (60.0, 80.0, 95.0, 105.0, 125.0, 150.0), 24, rng)
+        settings = params.load(TrainClassifier, "train_classifier")
+        _, frames, _ = read_frames(PRINTS, settings, params.load(params.Execution, "execution"))
+        network, size = restore_network(str(root / SHIPPED))
+        own = own_pictures.learn(network, frames, window=settings.window, false_alarms=settings.false_alarms)
+        folder = Path("champion/setpoint")
+        store_classifier(folder / "train_classifier", size, own.model)
+        loop = params.load(Nightly, "nightly").loops["setpoint"]
+        reference = screening.reference(loop, folder)
+        assert reference is not None
+        yield Path.cwd(), reference["camera"]
+
+
+def write_changed(change) -> None:
+    """The last print once more under another name, its pictures changed."""
+    log = (PRINTS / "log.csv").read_text().splitlines()
+    lines = [line.replace("print5/", "new/") for line in log if "print5/" in line]
+    named = [",".join([*line.split(",")[:-2], "new", line.split(",")[-1]]) for line in lines]
+    (PRINTS / "new.csv").write_text("\n".join([log[0], *named]) + "\n")
+    (PRINTS / "new").mkdir()
+    rng = np.random.default_rng(9)
+    for path in sorted((PRINTS / "print5").glob("*.jpg")):
+        grain = rng.normal(0, 3, (nozzle_pictures.HEIGHT, nozzle_pictures.WIDTH, 3))
+        picture = np.clip(change(cv2.imread(str(path))) + grain, 0, 255).astype(np.uint8)
+        cv2.imwrite(str(PRINTS / "new" / path.name), picture)
+        shutil.copystat(path, PRINTS / "new" / path.name)
+
+
+def zoomed(picture: np.ndarray, by: float) -> np.ndarray:
+    """About the nozzle's tip."""
+    tip = np.array(nozzle_pictures.draw_camera(np.random.default_rng(5)).tip)
+    return cv2.warpAffine(picture, np.column_stack([by * np.eye(2), (1 - by) * tip]), picture.shape[1::-1])
+
+
+@pytest.mark.parametrize(
+    ("zoom", "told", "foreign"),
+    [
+        (1.0, [], (0, 5)),
+        (0.6, ["the line stands out by"], (15, 100)),
+        (2.0, ["100 % of the frames show no line"], (0, 0)),
+    ],
+)
+def test_a_print_as_the_champion_s_classifier_sees_it(camera, monkeypatch, zoom, told, foreign):
+    folder, reference = camera
+    monkeypatch.chdir(folder)
+    write_changed(lambda picture: zoomed(picture, zoom))
+    drift, settings, champion = NightDrift(), params.load(Nightly, "nightly"), Path("champion/setpoint")
+    new = [str(PRINTS / "new.csv")]
+    try:
+        pictures.find_prints_drift(
+            drift, settings.drift, "setpoint", str(PRINTS), new, champion, reference, []
+        )
+        (one,) = pictures.of_prints(PRINTS, champion, 9, ["new"])
+    finally:
+        (PRINTS / "new.csv").unlink()
+        shutil.rmtree(PRINTS / "new")
+    said = [alarm.cause for alarm in (*drift.alarms, *drift.watched)]
+    assert len(said) == len(told) and all(map(str.startswith, said, told)), said
+    assert drift.quarantined == {} and drift.notes == []
+    share = 100 * one.familiar[1] / max(sum(one.familiar), 1)
+    assert foreign[0] <= share <= foreign[1]
+    assert sum(one.counts) == 144 and sum(one.familiar) == sum(one.counts[:3])
+
+
+def test_frames_that_the_classifier_never_saw_the_like_of_are_named_without_a_label():
+    before = np.array([[590, 10], [600, 0], [580, 20]])
+    assert camera_drift.foreign_changes(np.array([540, 60]), before, together=20, points=20.0) == []
+    (cause,) = camera_drift.foreign_changes(np.array([150, 450]), before, together=20, points=20.0)
+    assert cause.words.startswith(
+        "75 % of the frames look like none that the classifier learned from, where 2 %"
+    )
+    assert cause.sigmas > 4
