@@ -194,7 +194,7 @@ def cost_of(
         begin = [[0, steps // 3, 2 * (steps // 3)]] if kind == "sequence" else [[0]]
         cold = np.array([kind == "constant" and life.held is None])
         case = SimpleNamespace(
-            kind=np.array([kind]), begin=np.array(begin), plants=[0], steps=steps, cold=cold
+            kind=np.array([kind]), begin=np.array(begin), plant=np.zeros(1, int), steps=steps, cold=cold
         )
         low, high = setting.output_limits
         figures = panel.figures(
