@@ -173,6 +173,47 @@ int normal_life(const thermal_parts *p, double degC, uint64_t seed, int steps, i
     return result;
 }
 
+/* `steps` samples from the state s, without a fault: `held` of them in manual at the duties `manual`, then under the
+ * controller. The other arguments are those of normal_life. */
+int held_life(const thermal_parts *p, thermal_state *s, int steps, int held, int patience, const double *manual,
+              const double *r, const double *outside, double *y, double *sensor, double *u, signed char *modes,
+              signed char *causes, const double *told)
+{
+    static beadline_controller c;
+    beadline_machine machine = {BEADLINE_PLANT_SHA256, BEADLINE_INPUT_UNIT, BEADLINE_OUTPUT_UNIT,
+                                BEADLINE_SAMPLE_TIME_S, INPUTS, OUTPUTS};
+    beadline_decision d;
+    int k, left = 0, result = beadline_init(&c, &machine, 1);
+    for (k = 0; k < steps && !result; k++) {
+        double *now = y + k * OUTPUTS, *command = u + k * INPUTS;
+        thermal_read(s, p, now);
+        memcpy(sensor + k * OUTPUTS, s->sensor, OUTPUTS * sizeof *sensor);
+        if (DISTURBANCES)
+            result = beadline_tell(&c, told + k * DISTURBANCES);
+        causes[k] = -1;
+        modes[k] = MODE_LAW;
+        if (k < held) {
+            result = beadline_watch(&c, manual, now, r + k * OUTPUTS);
+            memcpy(command, manual, INPUTS * sizeof *command);
+        } else {
+            if (k == held && (result = beadline_hand_over(&c, now)))
+                break;
+            result = beadline_step(&c, now, r + k * OUTPUTS, k * BEADLINE_SAMPLE_TIME_S, 0, &d);
+            memcpy(command, d.u, INPUTS * sizeof *command);
+            modes[k] = (signed char)d.mode;
+            if (d.mode != MODE_LAW && d.causes)
+                causes[k] = (signed char)d.cause[0].kind;
+            left = d.mode == MODE_LAW ? 0 : left + 1;
+            if (patience && left >= patience) {
+                beadline_acknowledge(&c);
+                left = 0;
+            }
+        }
+        thermal_advance(s, p, command, outside + k * OUTSIDE);
+    }
+    return result;
+}
+
 const char *life_reason(int kind)
 {
     return beadline_reason(kind);
