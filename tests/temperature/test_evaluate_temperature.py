@@ -531,7 +531,7 @@ def test_a_resample_of_the_record_that_gives_another_controller_is_counted(given
 
 
 def test_the_margin_that_is_judged_is_that_of_the_plant_that_a_tenth_lie_below():
-    found = [scorecard.Margins(0.1 * k, float("inf") if k > 5 else float(k), True, 0.9) for k in range(11)]
+    found = [scorecard.Margins(0.1 * k, float("inf") if k > 5 else float(k), True) for k in range(11)]
     told = evaluation._margin_figures(found)
     assert told is not None
     assert told["disk"] == {"q10": 0.1, "median": 0.5, "worst": 0.0}

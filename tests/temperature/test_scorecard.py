@@ -15,8 +15,10 @@ from pipeline.temperature.plant import Plant, baam, plant
 from pipeline.temperature.test_set import scorecard
 from pipeline.temperature.test_set.scorecard import (
     CommonCost,
+    Margins,
     closed_loop,
     cost,
+    is_stable,
     law_response,
     margins,
     optimum,
@@ -295,10 +297,22 @@ def test_a_loop_whose_gain_stays_below_one_bears_any_delay():
     assert margins([plant([[0.5]], [[1.0]], [[1.0]])], static(0.3))[0].delay_s == np.inf
 
 
-def test_an_unstable_loop_has_no_margin_and_shows_its_radius():
-    margin = margins([plant([[0.5]], [[1.0]], [[1.0]])], static(2.0))[0]
-    assert (margin.disk, margin.delay_s, margin.stable) == (0.0, 0.0, False)
-    assert margin.radius == pytest.approx(1.5)
+def test_an_unstable_loop_has_no_margin():
+    steady = plant([[0.5]], [[1.0]], [[1.0]])
+    unstable = plant([[3.5]], [[1.0]], [[1.0]])
+    assert margins([unstable], static(2.0)) == [Margins(0.0, 0.0, False)]
+    # beside others, each has its own
+    found = margins([unstable, steady, unstable], static(1.0))
+    assert found == [Margins(0.0, 0.0, False), *margins([steady], static(1.0)), Margins(0.0, 0.0, False)]
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.5, 1 - 1e-6, 1.0, 1 + 1e-6, 3.0])
+def test_a_matrix_is_stable_if_its_largest_eigenvalue_is_inside_the_unit_circle(radius: float):
+    """In a basis in which it first grows a thousandfold."""
+    rng = np.random.default_rng(2)
+    eigenvalues = radius * np.r_[1.0, rng.uniform(-1, 1, 7)]
+    A = np.diag(eigenvalues) + 10.0 * np.triu(rng.standard_normal((8, 8)), 1)
+    assert is_stable(A) == (radius < 1)
 
 
 @pytest.mark.parametrize("integral", [0.0, 0.02])
