@@ -4,19 +4,15 @@ and the files that leave the house."""
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from pipeline.report.certificate import exported
-from pipeline.report.shared import charts, page, words
-from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture
+from pipeline.report.shared import page, words
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.controllers import BY_NAME, heading
 from pipeline.verdict.digits import number, with_unit
-from pipeline.verdict.evidence import Absent, entry, gap_of, known, need, need_figure, or_nothing
+from pipeline.verdict.evidence import entry, gap_of, known, need, need_figure, or_nothing
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 
 WORDS = ("verdict", "margin_disk", "margin_delay", "spread", "step", "hash")
-MOST_BANDS = 40  # gains that are listed, those that are surest of all inputs first
 
 
 def render(sources: Sources, verdict: Verdict) -> str:
@@ -34,10 +30,9 @@ def render(sources: Sources, verdict: Verdict) -> str:
         rules=rule_rows(whole) if whole else [],
         controllers=controllers(sources),
         about=about(whole) if whole else [],
-        poles=poles(sources, shown),
+        poles=poles(shown),
         margins=margins(whole) if whole else [],
         judged_margins=judged_margins(sources),
-        bands=band_rows(whole) if whole else [],
         lines=known(lines, []),
         origin_of=page.origin(sources.source("certificate", "export_controllers")),
         differences=differences(sources),
@@ -147,43 +142,15 @@ def _signal(one: Mapping[str, Any]) -> str:
     return f"{one['name']} in {one['unit']}, {low} to {high}"
 
 
-@as_picture("poles", "Poles of the closed loop")
-def poles(sources: Sources, shown: Mapping[str, Any] | Missing) -> Picture:
-    """Closed-loop poles: of the model, of its spread and of what the record leaves open."""
-    shown = need(shown)
-    if not shown["poles"]:
-        raise Absent(Missing(OPEN, "An earlier rule refused, so that none was computed"))
-    largest = max(one["radius"] for one in shown["poles"])
-    columns = [
-        PictureColumn(name, small, "", [_circle(shown["poles"], near=near, largest=largest)])
-        for name, small, near in (
-            ("The unit circle", "real part right, imaginary part up", False),
-            ("The slowest", "enlarged", True),
-        )
-    ]
-    plants = len(shown["poles"])
-    text = f"On {plants} plants the largest pole is of size {number(largest, 4)}: "
-    text += "stable." if largest < 1 else "not stable."
-    caption = "Crosses: the identified model. Dots: plants of its spread, and of what the record leaves open."
-    return Picture(text, columns, caption, page.origin(sources.source("certificate")))
-
-
-def _circle(loops: Sequence[Mapping[str, Any]], *, near: bool, largest: float):
-    low, high, up = (0.8, 1.02, 0.12) if near else (-1.1, 1.1, 1.1)
-    frame = charts.Frame(
-        charts.linear(low, high, ticks=3), charts.linear(-up, up, ticks=3), width=270, height=256, above=6
-    )
-    layers = [charts.line(frame, *charts.inside(frame, *charts.CIRCLE), "lim line thin", most=181)]
-    for model in (False, True):
-        points = [pair for one in loops if (one["of"] == "model") == model for pair in one["poles"]]
-        if points:
-            real, imag = charts.inside(frame, *np.array(points, float).T)
-            layers.append(
-                charts.crosses(frame, real, imag) if model else charts.dots(frame, real, imag, "try", 1.7)
-            )
-    return charts.panel(
-        frame, layers, alt=f"{len(loops)} closed loops, the largest pole of size {number(largest, 4)}"
-    )
+@or_nothing
+def poles(shown: Mapping[str, Any] | Missing) -> str:
+    """The largest closed-loop pole over the model, its spread and what the record leaves open; "" if an
+    earlier rule refused."""
+    radii = [one["radius"] for one in need(shown)["poles"]]
+    if not radii:
+        return ""
+    stable = "stable" if max(radii) < 1 else "not stable"
+    return f"On {len(radii)} plants the largest pole is of size {number(max(radii), 4)}: {stable}."
 
 
 def margins(shown: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -220,23 +187,6 @@ def judged_margins(sources: Sources) -> str:
         f"test set, {plants} other plants: disk margin {disk[0]} of the weakest tenth and {disk[1]} of the "
         f"worst, delay margin {delay[0]} and {delay[1]}."
     )
-
-
-def band_rows(shown: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    """Gains whose bands are surest, the ones furthest from zero by their own width first."""
-    bands = shown.get("bands")
-    if not bands:
-        return []
-    gain, low, high = (np.array(bands[key], float) for key in ("gain", "low", "high"))
-    sure = np.abs(gain) / np.maximum(high - low, 1e-12)
-    order = np.argsort(-sure, axis=None, kind="stable")[:MOST_BANDS]
-    inputs = [one["name"] for one in shown["inputs"]]
-    columns = gain.shape[1]
-    at = [divmod(int(k), columns) for k in order]
-    return [
-        (inputs[i], str(bands["on"][j]), f"{gain[i, j]:.3g}", f"{low[i, j]:.3g} to {high[i, j]:.3g}")
-        for i, j in at
-    ]
 
 
 def differences(sources: Sources) -> list[tuple[str, str]]:

@@ -90,7 +90,7 @@ def render(sources: Sources) -> str:
             for part, move in itertools.zip_longest(measured, deposition_card.moves(sources, measured))
         ],
         scoreboard=scoreboard(measured, sources.declared.rules),
-        learning=deposition_learning.pictures(sources),
+        learning=deposition_learning.errors(sources),
         frames=deposition_learning.frames(sources),
         measured=deposition_learning.measured(sources),
         camera=deposition_learning.camera(sources),

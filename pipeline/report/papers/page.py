@@ -7,14 +7,17 @@ made and whether its method has changed since. No verdict, choice or export read
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from pipeline.papers import made
-from pipeline.report.papers import deposition, setpoint, study, temperature
+from pipeline.report.papers import deposition, setpoint, temperature
 from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS, Paper, read
-from pipeline.report.papers.study import sentences
+from pipeline.report.papers.study import ranking
 from pipeline.report.shared import page
+from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
 from pipeline.store import artifacts
+from pipeline.verdict.evidence import Absent
 from pipeline.verdict.verdict import Missing
 
 # glyph of a verdict, by the states that the pages know
@@ -71,15 +74,17 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
         gaps=gaps,
         state=GLYPHS,
         fails=FAILS,
-        study=study.part(_results(others["reproduce_study"], "reproduce_study")),
-        relearned=sentences(_results(others["relearned"], "relearned")),
+        study=_results(others["reproduce_study"], "reproduce_study"),
+        ranking=ranking,
+        relearned=_results(others["relearned"], "relearned"),
         made={name: made.sentence(name) for name in others},
     )
 
 
-def _results(path: str, stage: str) -> Mapping | Missing:
+@as_table()
+def _results(path: str, stage: str) -> dict[str, Any]:
     if not artifacts.exists(path):
-        return Missing("not measured", f"{path} is not there", f"Run {made.command(stage)}")
+        raise Absent(Missing("not measured", f"{path} is not there", f"Run {made.command(stage)}"))
     return artifacts.read_json(path)
 
 

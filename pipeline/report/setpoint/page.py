@@ -4,9 +4,9 @@ case, and what the camera's classifier is worth."""
 from typing import Any
 
 from pipeline.report.deposition.page import flat
-from pipeline.report.setpoint import agent as setpoint_agent
 from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.setpoint import deciding as setpoint_deciding
+from pipeline.report.setpoint import harm as setpoint_harm
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
 from pipeline.report.shared import charts, page, words
@@ -70,7 +70,6 @@ def render(sources: Sources) -> str:
     """The text of setpoint.html."""
     judged, scores = sources.verdicts["setpoint"], board(sources.evidence, sources.subject("setpoint"))
     judged_scores = known(scores, None)
-    claimed = setpoint_agent.claims(sources)
     return page.render(
         "setpoint.html",
         here="setpoint",
@@ -99,29 +98,18 @@ def render(sources: Sources) -> str:
         deciding=setpoint_deciding.picture(sources, scores),
         boards=boards(sources, judged_scores) if judged_scores else [],
         worsts=worsts(judged_scores) if judged_scores else [],
-        harms=setpoint_agent.harms(sources, scores),
+        harms=setpoint_harm.harms(sources, scores),
         why_default=choice_sentence(sources),
-        ways=setpoint_agent.ways(sources, scores),
         strips=setpoint_why.strips(sources),
-        training=setpoint_agent.training(sources),
-        phases=setpoint_agent.phases(sources),
-        claims=known(claimed, []),
-        claims_missing=gap_of(claimed),
-        guesses=setpoint_agent.guesses(sources),
-        agent_made=setpoint_agent.kept_sentence(),
         good_named=good_named(sources),
         by_flow=setpoint_vision.by_flow(sources),
         yardsticks=setpoint_vision.yardsticks(sources),
         reliability=setpoint_vision.reliability(sources),
-        confusion=setpoint_vision.confusion(sources),
-        distributions=setpoint_vision.distributions(sources),
-        course=setpoint_vision.learning_curves(sources),
         frames=setpoint_vision.frames(sources),
         data=setpoint_vision.data(sources),
         declared=[(section, flat(sources.declared.everything.get(section, {}))) for section in SECTIONS],
         words=words.chosen(sources, WORDS),
         from_board=sources.source("scoreboard", "choice"),
-        from_agents=sources.source("train_agent"),
         from_classifier=sources.source("train_classifier", "classified"),
     )
 

@@ -18,6 +18,7 @@ from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
 from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from pipeline.verdict import digits
+from pipeline.verdict.controllers import in_a_sentence
 from pipeline.verdict.settings import QUICK_LOOK
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 
@@ -82,6 +83,10 @@ def environment() -> jinja2.Environment:
         "shortened": digits.shortened,
         "typeset": digits.typeset,
         "count": digits.count,
+        "number": digits.number,
+        "percent": digits.percent,
+        "short": digits.short,
+        "in_a_sentence": in_a_sentence,
     }
     return templates
 
