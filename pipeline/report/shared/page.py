@@ -19,6 +19,8 @@ from pipeline.store.printable import printable_page
 from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from pipeline.verdict import digits
 from pipeline.verdict.controllers import in_a_sentence
+from pipeline.verdict.deposition import NOT_JUDGED
+from pipeline.verdict.evidence import entry
 from pipeline.verdict.settings import QUICK_LOOK
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 
@@ -72,6 +74,8 @@ def environment() -> jinja2.Environment:
         "missing": missing,
         "term": term,
         "word_id": word_id,
+        "entry": entry,
+        "not_judged": NOT_JUDGED,
     }
     script = Markup(templates.get_template("page.js").render().strip())
     templates.globals |= {
