@@ -13,7 +13,7 @@ from pipeline.report.deposition.parts import real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
 from pipeline.report.shared.sources import Sources, first_routine
-from pipeline.verdict.digits import THIN, count, number, percent, short
+from pipeline.verdict.digits import THIN, number, percent, short
 from pipeline.verdict.evidence import Absent, Table, entry, known, lookup, need
 from pipeline.verdict.verdict import Missing
 
@@ -187,25 +187,7 @@ def frames(sources: Sources) -> dict[str, Any]:
     # the corner tells most, then what was rejected
     order = {"start": 0, "steady line": 1, "corner": 2, "rejected": 3}
     rows = sorted(pictures, key=lambda row: (row["material"], row["trial"], order.get(row["place"], 9)))
-    return {"shown": [_frame(row) for row in rows], "origin": page.origin(sources.source("frames"))}
-
-
-def _frame(row: dict[str, Any]) -> dict[str, Any]:
-    """A row of the index of frames, in words."""
-    of, at = f"aterial {row['material']}, trial {row['trial']}", number(row["time_s"], 2)
-    if row["reason"]:
-        figure = judged = f"rejected: {row['reason']}"
-    else:
-        width = number(row["width_mm"], 3)
-        figure, judged = f"{width}{THIN}mm wide", f"the bead’s edges found, {width} mm apart"
-    return {
-        "uri": Markup("{}").format(row["uri"]),
-        "head": f"M{of}, {row['place']}",
-        "figure": figure,
-        "bad": bool(row["reason"]),
-        "foot": (row["recording"], f"{row['topic']} at {at}{THIN}s"),
-        "alt": f"Frame of m{of}, at {at} s, {judged}",
-    }
+    return {"shown": rows, "origin": page.origin(sources.source("frames"))}
 
 
 @as_picture("told", "The flow that the pictures told")
@@ -335,7 +317,7 @@ def _measured_panels(mine: Table, wide: float, name: str, machine: bool, *, titl
     ]
 
 
-@as_table(untold="")
+@as_table(untold=[])
 def camera(sources: Sources) -> dict[str, Any]:
     """By material: frames read and rejected, uncertainty, and what the calibration left."""
     filmed, models = need(sources.tables["filmed"]), sources.tables["models"]
@@ -348,58 +330,26 @@ def camera(sources: Sources) -> dict[str, Any]:
         observable=("observable", "mean"),
         outliers=("outliers", "sum"),
     )  # fmt: skip
-    rows = [_filmed(row, models, sources) for row in by_material.itertuples()]
-    return {"rows": rows, "untold": ", ".join(row["material"] for row in rows if row["untold"])}
+    rows = [row | _told(sources, row["material"]) for row in by_material.reset_index().to_dict("records")]
+    for row in rows:
+        row["calibration"] = entry(models, row["material"], "calibration")
+    untold = [row["material"] for row in rows if any(late["s"] is None for late in row["latencies"])]
+    given = entry(sources.declared.everything, "camera", "latency_s") is not None
+    return {"rows": rows, "untold": untold, "given": given}
 
 
-def _filmed(row: Any, models: dict[str, Any] | Missing, sources: Sources) -> dict[str, Any]:
-    """One material's sums, in words."""
-    latency, untold = _latency(sources, row.Index)
-    return {
-        "material": row.Index,
-        "trials": count(row.trials, "trial"),
-        "frames": number(row.frames, 0),
-        "rejected": f"{number(row.rejected, 0)} ({percent(100 * row.rejected / max(row.frames, 1), 2)})",
-        "why": row.reasons,
-        "deviation": f"{short(1000 * row.deviation, 2)}{THIN}·10⁻³ mm³/s",
-        "observable": percent(100 * row.observable, 3),
-        "outliers": number(row.outliers, 0),
-        "calibration": _calibration(models, row.Index),
-        "latency": latency,
-        "untold": untold,
-        "delay": _delay(sources, row.Index),
-    }
-
-
-def _latency(sources: Sources, material: str) -> tuple[str, bool]:
-    """How late the camera is against the gantry, with its 90 % interval, of each routine that was learned
-    through pictures; and whether the pictures of one do not tell it, so that nothing was corrected."""
+def _told(sources: Sources, material: str) -> dict[str, Any]:
+    """How late the camera is against the gantry, of each routine that was learned through pictures, and the
+    identified delay from plunger to flow, which is not the camera's; both in s, None if not told."""
     laws = known(sources.metrics["train_ilc"], {}).get(material, {})
-    figures = [
-        figures for law, figures in laws.items() if law.startswith("pixels") and "latency_s" in figures
+    latencies = [
+        {"s": figures["latency_s"], "deviation_s": figures.get("latency_deviation_s")}
+        for law, figures in laws.items()
+        if law.startswith("pixels") and "latency_s" in figures
     ]
-    untold = any(each["latency_s"] is None for each in figures)
-    given = sources.declared.everything.get("camera", {}).get("latency_s") is not None
-    texts = [_late(each["latency_s"], each.get("latency_deviation_s"), given) for each in figures]
-    return "; ".join(dict.fromkeys(texts)) or "not measured", untold
-
-
-def _late(latency_s: float | None, deviation_s: float | None, given: bool) -> str:
-    if latency_s is None:
-        return "not told: declare camera.latency_s"
-    late = 1000 * latency_s
-    if given or deviation_s is None:
-        return f"{number(late, 1)}{THIN}ms, as declared"
-    wide = 1645 * deviation_s
-    return f"{number(late, 1)}{THIN}ms ({number(late - wide, 1)} to {number(late + wide, 1)})"
-
-
-def _delay(sources: Sources, material: str) -> str:
-    """The identified delay from plunger to flow, which is not the camera's."""
     learned = known(lookup(sources.tables["learned"], "materials"), [])
     chain = next((one["chain"] for one in learned if one["material"] == material), {})
-    delay_s = entry(chain, "extruder", "delay_s")
-    return "not measured" if delay_s is None else f"{number(1000 * delay_s, 0)}{THIN}ms"
+    return {"latencies": latencies, "delay_s": entry(chain, "extruder", "delay_s")}
 
 
 def _reasons(texts: Iterable[str]) -> str:
@@ -409,15 +359,3 @@ def _reasons(texts: Iterable[str]) -> str:
         name, _, frames = reason.rpartition(" ")
         frames_of[name] += int(frames) if frames.isdigit() else 1
     return ", ".join(f"{name} {number(frames, 0)}" for name, frames in sorted(frames_of.items())) or "none"
-
-
-def _calibration(models: dict[str, Any] | Missing, material: str) -> str:
-    """Scale of a calibration and what it left, in um and px."""
-    calibration = entry(models, material, "calibration")
-    if calibration is None:
-        return "as recorded"
-    gain, deviation = calibration["gain"], calibration["deviation"]
-    return (
-        f"{number(1000 * gain, 3)}{THIN}µm/px, residual {number(1000 * deviation, 2)}{THIN}µm "
-        f"({number(deviation / gain, 2)}{THIN}px)"
-    )
