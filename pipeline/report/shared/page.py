@@ -89,6 +89,7 @@ def environment() -> jinja2.Environment:
         "count": digits.count,
         "number": digits.number,
         "percent": digits.percent,
+        "quantity": digits.quantity,
         "short": digits.short,
         "in_a_sentence": in_a_sentence,
     }
