@@ -31,7 +31,6 @@ from pipeline.verdict.identification import (
 from pipeline.verdict.verdict import Figure, Missing
 
 MOST_INPUTS = 7  # panels in a row of a matrix; a machine with more shows the strongest
-LEAST_P = 1e-6  # smaller ones are all the same to a reader
 
 REFINED = {
     "subspace": "none, the subspace fit stands",
@@ -52,57 +51,17 @@ def loop_state(sources: Sources) -> dict[str, Any]:
     if not p_values:
         reason = "the record is noise-free: it holds no errors that an input could answer"
         raise Absent(Missing("not applicable", reason))
-    level = tested.get("level", 0.0)
-    if tested["closed"]:
-        answering = [name for name, p in p_values.items() if p < level] or [min(p_values, key=p_values.get)]
-        largest = max(p_values[name] for name in answering)
-        test = (
-            f"{listed(answering)} {'answers' if len(answering) == 1 else 'answer'} past errors of the "
-            f"outputs ({_p(largest)}), as a controller does."
-        )
-        return {
-            "closed": True,
-            "head": "Recorded in closed loop.",
-            "test": test,
-            "follows": _closed_follows(sources),
-        }
-    nearest = min(p_values, key=p_values.get)
-    threshold = f"; feedback is called below {short(level, 2)}" if level else ""
-    test = (
-        f"No input is seen to answer past errors of the outputs: least {_p(p_values[nearest])}, "
-        f"{nearest}{threshold}."
-    )
+    nearest, level = min(p_values, key=p_values.get), tested.get("level", 0.0)
+    answering = [name for name, p in p_values.items() if p < level] or [nearest]
     return {
-        "closed": False,
-        "head": "No feedback was recognised.",
-        "test": test,
-        "follows": "The model is identified as from an open loop. A weak proportional controller whose "
-        "set-point never moves stays below this test: where the machine had one, believe the fit some steps "
-        "ahead before the simulation.",
+        "closed": tested["closed"],
+        "level": level,
+        "nearest": nearest,
+        "least": p_values[nearest],
+        "answering": answering,
+        "largest": max(p_values[name] for name in answering),
+        "fit": known(lookup(sources.metrics["identify_plant"], "fit"), ""),
     }
-
-
-def _closed_follows(sources: Sources) -> str:
-    fitted = lookup(sources.metrics["identify_plant"], "fit")
-    if fitted == "simulation":
-        how = (
-            "identify_plant.refinement asks for a fit to simulated outputs all the same, which feedback "
-            "biases: set it to validated."
-        )
-    else:
-        how = (
-            "The model was therefore identified in predictor form (PBSID), which feedback does not bias, and "
-            "judged one step ahead as well, without feed-through and without fits to simulated outputs."
-        )
-    return (
-        "Noise of the outputs is then in the inputs, and a fit to simulated outputs bends towards the "
-        f"inverse of the controller. {how} The fit in simulation on the hold-out flatters. Set-point steps "
-        "or a small dither on each input make the next record surer."
-    )
-
-
-def _p(value: float) -> str:
-    return "p below 0.000001" if value < LEAST_P else f"p = {short(value, 2)}"
 
 
 # ---- gains that physics forbids
@@ -119,22 +78,9 @@ def flagged(sources: Sources) -> dict[str, Any]:
     if not heaters:
         reason = "no input is declared to heat, so no sign is known to be wrong"
         raise Absent(Missing("not applicable", reason, "Set heats: true for heaters in plant.inputs"))
-    finding = f"None: every effect of {listed(heaters)} is one that a heater can have."
-    if gains:
-        finding = f"{flagged_sentence(gains)} {flagged_remedy(gains)}"
-    return {"finding": finding, "rows": [_flagged_row(gain) for gain in gains]}
-
-
-def _flagged_row(gain: dict[str, Any]) -> dict[str, Any]:
-    places = decimals(gain["low"], gain["high"], value=gain["gain"])
-    return {
-        "output": gain["output"],
-        "input": gain["input"],
-        "gain": number(gain["gain"], places),
-        "band": band(gain["low"], gain["high"], places),
-        "reason": gain["reason"],
-        "certain": gain["certain"],
-    }
+    finding = f"{flagged_sentence(gains)} {flagged_remedy(gains)}" if gains else ""
+    rows = [gain | {"places": decimals(gain["low"], gain["high"], value=gain["gain"])} for gain in gains]
+    return {"finding": finding, "heaters": heaters, "rows": rows}
 
 
 # ---- what was chosen

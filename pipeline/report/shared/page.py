@@ -90,6 +90,8 @@ def environment() -> jinja2.Environment:
         "number": digits.number,
         "percent": digits.percent,
         "quantity": digits.quantity,
+        "band": digits.band,
+        "listed": digits.listed,
         "short": digits.short,
         "in_a_sentence": in_a_sentence,
     }
