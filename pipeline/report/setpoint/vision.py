@@ -11,26 +11,13 @@ from markupsafe import Markup
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.digits import THIN, band, number, percent, quantity, short
-from pipeline.verdict.evidence import (
-    Absent,
-    Table,
-    entry,
-    gap_of,
-    instead,
-    known,
-    lookup,
-    need,
-    need_figure,
-    or_empty,
-)
-from pipeline.verdict.setpoint import CLASS_BORDERS, accuracy, share_in, share_text
+from pipeline.verdict.digits import THIN, band, number, quantity
+from pipeline.verdict.evidence import Absent, Table, entry, gap_of, instead, known, lookup, need, need_figure
+from pipeline.verdict.setpoint import CLASS_BORDERS, accuracy, share_in
 from pipeline.verdict.verdict import Figure, Missing
 
 CLASSES = ("under", "good", "over")
-# characters of a frame's place in its recording that are shown, its end
-LONGEST = 60
-NAMES = {"svc": "support vector machine", "width": "width rule"}
+NAMES = {"": "Vision transformer", "svc": "Support vector machine", "width": "Width rule"}
 DIAGRAMS = (
     ("image", "raw", "One image, as trained", "softmax of the network", "ece_image_raw"),
     ("image", "calibrated", "One image, calibrated", "logits over one temperature", "ece_image"),
@@ -97,81 +84,36 @@ def _diagram(bins: Table, head: str, of: str, words: str, *, title: str) -> Mark
     )
 
 
-# ---- windows
-
-
-# ---- training
-
-
 # ---- tables and frames
 
 
 @as_table()
 def yardsticks(sources: Sources) -> dict[str, Any]:
-    """The transformer beside the simpler ways, an image and a window."""
+    """The transformer beside the simpler ways, an image and a window, [key, head, shares]; whether it may
+    judge; how each kind of foreign picture was detected."""
     metrics = need(sources.metrics["train_classifier"])
-    rows = []
-    for name, head in (
-        ("", "Vision transformer"),
-        *((key, text[:1].upper() + text[1:]) for key, text in NAMES.items()),
-    ):
-        if gap_of(accuracy(metrics, f"{name}_image".strip("_"))):
-            continue  # of few own pictures no other way is learned
-        cells = []
-        # of windows of all flows none is asked: the rule asks for 70 to 150 %
-        for of, limit in (("image", sources.declared.rules.image_accuracy), ("window", 0.0)):
-            share = accuracy(metrics, f"{name}_{of}".strip("_"))
-            cells.append(
-                {
-                    "text": share_text(share),
-                    "band": band(share.low, share.high, 1) if isinstance(share, Figure) else "",
-                    "bad": isinstance(share, Figure) and not name and share.value < 100 * limit,
-                }
-            )
-        rows.append({"name": head, "mark": "baseline" if name else "data_driven", "cells": cells})
-    said = lookup(metrics, "proof.verdict")
-    proof = gap.sentence() if (gap := gap_of(said)) else f"The classifier: {said}."
-    return {"rows": rows, "proof": proof, "foreign": _foreign(metrics)}
-
-
-@or_empty
-def _foreign(metrics: Any) -> list[dict[str, str]]:
-    """How each kind of foreign picture was detected."""
-    detection = need_figure(metrics, "out_of_distribution")
-    return [
-        {
-            "kind": str(kind),
-            "auroc": "not measured" if figures["auroc"] is None else number(float(figures["auroc"]), 3),
-            "detected": _share(figures.get("found")),
-            "alarms": _share(figures.get("false_alarms", detection.get("false_alarms"))),
-        }
-        for kind, figures in detection.items()
-        if isinstance(figures, dict) and "auroc" in figures
+    rows = [
+        (name, head, [accuracy(metrics, f"{name}_{of}".strip("_")) for of in ("image", "window")])
+        for name, head in NAMES.items()
     ]
+    found = known(lookup(metrics, "out_of_distribution"), {})
+    foreign = {kind: one for kind, one in found.items() if isinstance(one, dict) and "auroc" in one}
+    return {
+        # of few own pictures no other way is learned
+        "rows": [row for row in rows if not gap_of(row[2][0])],
+        "limit": 100 * sources.declared.rules.image_accuracy,
+        "proof": lookup(metrics, "proof.verdict"),
+        "foreign": foreign,
+        "false_alarms": found.get("false_alarms"),
+    }
 
 
-def _share(value: float | None) -> str:
-    return "not measured" if value is None else percent(100 * value, 2)
-
-
-@instead(lambda gap: [("Frames", gap.sentence())])
-def data(sources: Sources) -> list[tuple[str, str]]:
-    """What was shown to it: frames, rejections by reason, segments."""
+@as_table()
+def data(sources: Sources) -> dict[str, Any]:
+    """What was shown to it: frames, rejections by reason, segments; and the network."""
     metrics = sources.metrics["train_classifier"]
     counts = need_figure(metrics, "data")
-    frames, valid = counts.get("frames"), counts.get("valid")
-    rejected = counts.get("rejected") or {}
-    rows = [("Source", str(entry(metrics, "source") or "not said"))]
-    rows += (
-        [("Frames", f"{frames:,}, of which {valid:,} ({percent(100 * valid / frames, 3)}) show a fresh line")]
-        if frames and valid is not None
-        else []
-    )
-    if isinstance(rejected, dict):
-        rows += [("Rejected", ", ".join(f"{reason} {n:,}" for reason, n in rejected.items()) or "none")]
-    rows += [("Segments", f"{counts['segments']:,}")] if isinstance(counts.get("segments"), int) else []
-    size, n = entry(metrics, "size"), entry(metrics, "parameters")
-    return rows + ([("Classifier", f"{size}, {n:,} parameters")] if size and n else [])
+    return counts | {key: entry(metrics, key) for key in ("source", "size", "parameters")}
 
 
 # kinds of real frames in the order of the page
@@ -181,68 +123,17 @@ GROUPS = {
     "rejected": "Rejected by the front end",
     "foreign": "Foreign to the classifier",
 }
-RENDERED = "These frames are rendered."
-RECORDED = (
-    "These frames are real, of prints that nothing was learned from; shares are of all of their frames."
-)
 
 
-@as_table(lead="")
+@as_table(recorded=False)
 def frames(sources: Sources) -> dict[str, Any]:
     """Frames with key area and direction drawn in, of a rejected one the reason; where the classifier learned
     from recordings real ones: accepted, wrong, rejected and foreign, each with its share."""
-    index = need(sources.tables["nozzle_frames"])
-    table: list[Any] = list(index)
-    recorded = [row for row in table if row.get("group") in GROUPS]
+    table: list[Any] = list(need(sources.tables["nozzle_frames"]))
+    groups = [(head, [row for row in table if row.get("group") == kind]) for kind, head in GROUPS.items()]
+    recorded = [(head, rows) for head, rows in groups if rows]
     origin = page.origin(sources.source("nozzle_frames"))
-    if not recorded:
-        return {
-            "groups": [{"head": "", "share": "", "shown": [_frame(row) for row in table]}],
-            "lead": RENDERED,
-            "origin": origin,
-        }
-    groups = []
-    for kind, head in GROUPS.items():
-        mine = [row for row in recorded if row["group"] == kind]
-        share = percent(100 * mine[0]["share"], 2) if mine and mine[0].get("share") is not None else ""
-        if mine:
-            groups.append({"head": head, "share": share, "shown": [_frame(row) for row in mine]})
-    return {"groups": groups, "lead": RECORDED, "origin": origin}
-
-
-def _frame(row: dict[str, Any]) -> dict[str, Any]:
-    """A row of the index of frames, in words."""
-    reason, named, p, label = row.get("reason") or "", row.get("named"), row.get("p"), row.get("label")
-    truth = CLASSES[label] if isinstance(label, int) and 0 <= label < 3 else "not known"
-    judged = (
-        f"named {CLASSES[named]}, {number(max(p), 2)}"
-        if isinstance(named, int) and 0 <= named < 3 and p
-        else "not named"
-    )
-    state = f"{'held' if p else 'rejected'}: {reason}" if reason else judged
-    wrong = row.get("group") == "wrong"
-    flow = (
-        ""
-        if row.get("flow_percent") is None
-        else f"flow {quantity(float(row['flow_percent']), '%', 0)} ({truth})"
-    )
-    heat = "" if row.get("temperature_degC") is None else f"{row['temperature_degC']:g}{THIN}°C"
-    score = (
-        ""
-        if row.get("score") is None
-        else f"the line stands out by {short(float(row['score']), 2)} gray levels"
-    )
-    place = "" if row.get("place") in (*CLASSES, "rejected", *GROUPS) else str(row.get("place", ""))
-    source = str(row.get("source") or "")
-    source = source if len(source) <= LONGEST else "\u2026" + source[-LONGEST:]
-    return {
-        "uri": Markup("{}").format(row["uri"]),
-        "head": ", ".join(filter(None, (flow, heat))) or "Frame",
-        "figure": state,
-        "bad": bool(reason) or wrong,
-        "foot": ", ".join(filter(None, (place, score, source))),
-        "alt": f"Frame {row['file']}: {state}",
-    }
+    return {"groups": recorded or [("", table)], "recorded": bool(recorded), "origin": origin}
 
 
 BY_FLOW = "Named rightly, by flow"
