@@ -18,7 +18,7 @@ from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
 from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from pipeline.verdict import digits
-from pipeline.verdict.controllers import in_a_sentence
+from pipeline.verdict.controllers import heading, in_a_sentence
 from pipeline.verdict.deposition import NOT_JUDGED
 from pipeline.verdict.evidence import entry
 from pipeline.verdict.settings import QUICK_LOOK
@@ -93,6 +93,7 @@ def environment() -> jinja2.Environment:
         "band": digits.band,
         "listed": digits.listed,
         "short": digits.short,
+        "heading": heading,
         "in_a_sentence": in_a_sentence,
     }
     return templates
