@@ -11,7 +11,7 @@ from markupsafe import Markup
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table, placeholder
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.digits import THIN, band, number, quantity
+from pipeline.verdict.digits import number
 from pipeline.verdict.evidence import Absent, Table, entry, gap_of, instead, known, lookup, need, need_figure
 from pipeline.verdict.setpoint import CLASS_BORDERS, accuracy, share_in
 from pipeline.verdict.verdict import Figure, Missing
@@ -184,78 +184,22 @@ def bins(metrics: Mapping | Missing) -> list[Bin]:
     return rows
 
 
-def place(row: Bin) -> str:
-    return f"{row.low:g}–{row.high:g}{THIN}%"
-
-
-@instead(lambda gap: {"picture": placeholder("by-flow", BY_FLOW, gap), "rows": (), "ideal": False})
+@instead(lambda gap: {"picture": placeholder("by-flow", BY_FLOW, gap), "rows": ()})
 def by_flow(sources: Sources) -> dict[str, Any]:
-    """The chart, and its bins as a table, the worst first."""
+    """The chart, and its bins, the worst first; the share if every flow were as frequent; the ideal reader's,
+    and the width bias behind it, None where there is none."""
     metrics = sources.metrics["train_classifier"]
     found = bins(metrics)
     ideal = any(row.ideal == row.ideal for row in found)
-    caption = (
-        f"Bars: windows named rightly, by bins of 5{THIN}% of true flow; strokes: their 95{THIN}% intervals, "
-        "by segment. Pale: a bin beside a border of the classes. Segments that nothing was learned, "
-        "calibrated or chosen on."
-    )
-    if ideal:
-        caption += (
-            f" Dashed: an ideal reader of the drawn width, {number(IDEAL, 1)}{THIN}% over all bins: every "
-            f"segment carries a width bias of {WIDTH_BIAS:g}{THIN}%, which no picture tells from flow."
-        )
+    column = PictureColumn("Windows named rightly", "in per cent, by true flow", "", [_chart(found)])
+    origin = page.origin(sources.source("train_classifier"))
     return {
-        "picture": Picture(
-            finding(found, known(lookup(metrics, "right_70_150"), None)),
-            [PictureColumn("Windows named rightly", "in per cent, by true flow", "", [_chart(found)])],
-            caption,
-            page.origin(sources.source("train_classifier")),
-            "by-flow",
-            BY_FLOW,
-        ),
-        "rows": [
-            {
-                "place": place(row),
-                "beside": row.beside,
-                "right": quantity(row.right.value, "%", 0),
-                "band": band(row.right.low, row.right.high, 0),
-                "ideal": number(row.ideal, 0) if row.ideal == row.ideal else "not known",
-                "windows": f"{row.windows:,}",
-            }
-            for row in found
-        ],
-        "ideal": ideal,
+        "picture": Picture("", [column], "", origin, "by-flow", BY_FLOW),
+        "rows": found,
+        "every": share_in(known(lookup(metrics, "right_70_150"), None)),
+        "ideal": IDEAL if ideal else None,
+        "bias": WIDTH_BIAS,
     }
-
-
-def finding(rows: Sequence[Bin], every: Any) -> str:
-    """The worst bin, the worst away from the borders, and all as if as frequent."""
-    text = _worst("Worst bin: ", rows[0])
-    away = [row for row in rows if not row.beside]
-    if rows[0].beside and away:
-        text += " It lies beside a border of the classes. " + _worst("Worst away from the borders: ", away[0])
-    if share := share_in(every):
-        text += (
-            f" Were every flow from 70 to 150{THIN}% as frequent: {quantity(share.value, '%', 1)} "
-            f"({band(share.low, share.high, 1)})"
-        )
-        text += f"; the ideal reader {quantity(IDEAL, '%', 1)}." if rows[0].ideal == rows[0].ideal else "."
-    return text
-
-
-def _worst(head: str, row: Bin) -> str:
-    ideal = (
-        f"; the ideal reader reaches {quantity(row.ideal, '%', 0)} there" if row.ideal == row.ideal else ""
-    )
-    return (
-        f"{head}{place(row)} of flow, {quantity(row.right.value, '%', 0)} right{_interval(row.right)}, "
-        f"{row.windows:,} windows{ideal}."
-    )
-
-
-def _interval(figure: Figure) -> str:
-    words = band(figure.low, figure.high, 0)
-    return f" ({words})" if words else ""
 
 
 def _chart(rows: Sequence[Bin]) -> Markup:
