@@ -20,7 +20,7 @@ from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from pipeline.verdict import digits
 from pipeline.verdict.controllers import heading, in_a_sentence
 from pipeline.verdict.deposition import NOT_JUDGED
-from pipeline.verdict.evidence import entry
+from pipeline.verdict.evidence import entry, gap_of
 from pipeline.verdict.settings import QUICK_LOOK
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 
@@ -75,6 +75,7 @@ def environment() -> jinja2.Environment:
         "term": term,
         "word_id": word_id,
         "entry": entry,
+        "gap_of": gap_of,
         "not_judged": NOT_JUDGED,
     }
     script = Markup(templates.get_template("page.js").render().strip())

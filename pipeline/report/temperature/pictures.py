@@ -353,27 +353,4 @@ def flaws(sources: Sources, most: int = 40) -> dict[str, Any]:
     quality = pd.DataFrame(table)
     quality = quality.assign(used=quality["kind"] != "quarantined", start=quality["start_s"].fillna(0.0))
     quality = quality.sort_values(["used", "recording", "signal", "kind", "start"])
-    return {
-        "rows": [
-            {
-                "recording": str(row["recording"]),
-                "signal": str(row["signal"]) or "whole recording",
-                "kind": str(row["kind"]),
-                "place": (
-                    ""
-                    if np.isnan(row["start_s"])
-                    else f"{_seconds(row['start_s'])} to {_seconds(row['end_s'])}{THIN}s"
-                ),
-                "samples": number(float(row["count"]), 0),
-                "message": str(row["message"]),
-                "bad": row["kind"] == "quarantined",
-            }
-            for row in quality.head(most).to_dict("records")
-        ],
-        "more": max(len(quality) - most, 0),
-        "missing": None,
-    }
-
-
-def _seconds(value: float) -> str:
-    return number(float(value), 0 if float(value).is_integer() or abs(value) >= 1000 else 2)
+    return {"rows": quality.head(most).to_dict("records"), "more": max(len(quality) - most, 0)}
