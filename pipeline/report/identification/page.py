@@ -4,8 +4,6 @@ pictures behind it, and what the record lost on the way."""
 import math
 from typing import Any
 
-import pandas as pd
-
 from pipeline.report.identification import how_identified, pictures
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.pictures import as_table
@@ -19,7 +17,6 @@ from pipeline.verdict.evidence import (
     lookup,
     need,
     need_figure,
-    or_empty,
     or_gap,
     or_none,
 )
@@ -72,9 +69,7 @@ def render(sources: Sources) -> str:
         cross=pictures.cross(sources),
         steps=pictures.steps(sources),
         order=pictures.order(sources),
-        candidates=candidates(sources),
         poles=pictures.poles(sources),
-        pole_rows=pictures.pole_table(sources),
         excitation=pictures.excitation(sources),
         planned=next_experiment(sources),
         from_planned=sources.source("generate_probing"),
@@ -217,17 +212,6 @@ def _sentence(text: str) -> str:
 
 
 # ---- tables
-
-
-@or_empty
-def candidates(sources: Sources) -> list[dict[str, Any]]:
-    """The order table with its rule: what each order keeps, costs and leaves unexplained."""
-    table = pd.DataFrame(need(sources.tables["order"]))
-    tried = table.error.notna()
-    chosen = int(table.order[table.chosen].max()) if table.chosen.any() else 0
-    last = max(chosen + 3, int(table.order[tried].max()) if tried.any() else 0)
-    table["tried"], table["above"] = tried, (table.error / table.error.min() - 1).fillna(0.0)
-    return table[table.order <= last].to_dict("records")
 
 
 @as_table(rows=[])

@@ -1,18 +1,20 @@
 """The figures of the identification page that show the model's errors: on the
 hold-out, with themselves, and with the inputs."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.identification.how_identified import MOST_INPUTS, left_out_words, loop_state
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.digits import DASH, THIN, band, count, decimals, number, short
-from pipeline.verdict.evidence import Table, entry, known, lookup, need, need_figure, or_empty
+from pipeline.verdict.digits import THIN, band, count, decimals, number, short
+from pipeline.verdict.evidence import Table, entry, known, lookup, need, need_figure
 from pipeline.verdict.identification import Fit, percent_of
 
 
@@ -39,8 +41,8 @@ def room(panels: int) -> Room:
 def as_matrix(id: str, title: str) -> Callable[[Callable[..., dict]], Callable[..., dict]]:
     """A decorator: a matrix of panels with its id and title; if it needs something that is absent, the
     reason."""
-    empty = {"finding": "", "rows": [], "caption": "", "origin": Markup(""), "across": 0}
-    named = {"id": id, "title": title}
+    empty = {"rows": [], "origin": Markup(""), "across": 0}
+    named = {"id": id, "title": title, "finding": "", "caption": "", "columns": []}
     return lambda draw: lambda sources: named | as_table(**empty)(draw)(sources)
 
 
@@ -400,85 +402,49 @@ def _span(values: Sequence[float]) -> str:
 # ---- order and poles
 
 
-@as_picture("order", "How many states the record asks for")
-def order(sources: Sources) -> Picture:
-    """How the order was chosen; its candidates stand in a table."""
-    table = need(sources.tables["order"])
-    chosen = int(table["order"][table["chosen"]][0]) if table["chosen"].any() else 0
-    given = sources.declared.everything.get("identify_plant", {}).get("order") or 0
-    tried = np.isfinite(table["error"]).any()
-    tolerance = entry(sources.metrics["identify_plant"], "order_tolerance_percent")
-    near = "near the best" if tolerance is None else f"within {tolerance:g}{THIN}% of the best"
-    if given:
-        text = f"Order {chosen}, as identify_plant.order asks; the data were not asked."
-    elif tried:
-        text = f"Order {chosen}: the fewest free numbers whose error on what was left out is {near}."
-    else:
-        text = f"Order {chosen}: the record is noise-free, and its rank decides."
-    edge = short(float(table["noise_edge"][0]), 3)
-    caption = (
-        f"The rule: orders whose singular value rises above what noise alone reaches, {edge}, are tried; "
-        f"each is identified with {left_out_words(sources)} and simulated on it"
-        f"{', and predicted one step ahead' if loop_state(sources)['closed'] else ''}. "
-        f"Of those whose error is {near}, the one with the fewest free numbers wins. "
-        "Window, feed-through, order and refinement were chosen together."
-    )
-    return Picture(text, [], caption if tried else "", page.origin(sources.source("order")))
+@as_matrix("order", "How many states the record asks for")
+def order(sources: Sources) -> dict[str, Any]:
+    """The orders with the rule that chose one: what each keeps, costs and leaves unexplained."""
+    table = pd.DataFrame(need(sources.tables["order"]))
+    tried = table.error.notna()
+    chosen = int(table.order[table.chosen].max()) if table.chosen.any() else 0
+    last = max(chosen + 3, int(table.order[tried].max()) if tried.any() else 0)
+    table["tried"], table["above"] = tried, (table.error / table.error.min() - 1).fillna(0.0)
+    return {
+        "rows": table[table.order <= last].to_dict("records"),
+        "chosen": chosen,
+        "given": sources.declared.everything.get("identify_plant", {}).get("order"),
+        "tried": bool(tried.any()),
+        "tolerance": entry(sources.metrics["identify_plant"], "order_tolerance_percent"),
+        "edge": float(table.noise_edge[0]),
+        "left_out": left_out_words(sources),
+        "closed": loop_state(sources)["closed"],
+        "origin": page.origin(sources.source("order")),
+    }
 
 
-@as_picture("poles", "Poles, and how surely they are known")
-def poles(sources: Sources) -> Picture:
-    """Whether the poles are stable; each stands in a table, beside what the spread makes of it."""
-    table = need(sources.tables["poles"])
-    mine = table["member"] == 0
-    slowest = float(np.hypot(table["real"][mine], table["imag"][mine]).max())
-    text = (
-        f"{count(int(mine.sum()), 'pole').capitalize()}, the largest of size {number(slowest, 4)}: "
-        f"{'stable' if slowest < 1 else 'not stable'}."
-    )
-    caption = f"Bands are over {count(int(table['member'].max()), 'plant')} of the spread."
-    bandwidth = lookup(sources.metrics["identify_plant"], "bandwidth_rad_s")
-    if isinstance(bandwidth, float):
-        caption += (
-            f" Bandwidth by singular values: {short(bandwidth, 3)} rad/s, a time constant of "
-            f"{short(1 / bandwidth, 3)} s."
-        )
-    return Picture(text, [], caption, page.origin(sources.source("poles")))
-
-
-@or_empty
-def pole_table(sources: Sources) -> list[dict[str, str]]:
-    """Each pole of the model, a pair in one row: size, time constant
-    with its band over the spread, period."""
-    table, step = need(sources.tables["poles"]), sources.declared.machine.sample_time_s
-    rows = []
-    for k in np.flatnonzero((table["member"] == 0) & (table["imag"] >= 0)):
-        value = complex(table["real"][k], table["imag"][k])
-        others = (table["pole"] == table["pole"][k]) & (table["member"] > 0)
-        sizes = np.hypot(table["real"][others], table["imag"][others])
-        constant = _constant(abs(value), step)
-        low, high = (
-            np.sort([_constant(size, step) for size in np.quantile(sizes, [0.05, 0.95])])
-            if len(sizes)
-            else (np.nan, np.nan)
-        )
-        again = low <= constant <= high
-        rows.append(
-            {
-                "size": number(abs(value), 4),
-                "pair": "pair" if value.imag else "",
-                "constant": f"{short(constant, 3)}{THIN}s" if np.isfinite(constant) else "none",
-                "band": ""
-                if np.isnan(low + high)
-                else f"{short(low, 3)}{DASH}{short(high, 3)}"
-                if again
-                else "not found again",
-                "period": f"{short(2 * np.pi * step / abs(np.angle(value)), 3)}{THIN}s"
-                if value.imag or value.real < 0
-                else "",
-            }
-        )
-    return rows
+@as_matrix("poles", "Poles, and how surely they are known")
+def poles(sources: Sources) -> dict[str, Any]:
+    """Each pole of the model, a pair in one row: size, time constant with its 90 % band over the spread, and
+    period in s; how many poles and plants there are, the largest size, and the bandwidth."""
+    table, step = pd.DataFrame(need(sources.tables["poles"])), sources.declared.machine.sample_time_s
+    table["size"] = np.hypot(table["real"], table["imag"])
+    table["constant_s"] = [_constant(size, step) for size in table["size"]]
+    sizes = table[table.member > 0].groupby("pole")["size"]
+    ends = {pole: [_constant(end, step) for end in mine.quantile([0.05, 0.95])] for pole, mine in sizes}
+    model = table[table.member == 0]
+    rows = model[model["imag"] >= 0].to_dict("records")
+    for row in rows:
+        row["band"] = ends.get(row["pole"], [math.nan, math.nan])
+        row["period_s"] = 2 * math.pi * step / max(abs(math.atan2(row["imag"], row["real"])), 1e-300)
+    return {
+        "rows": rows,
+        "of": len(model),
+        "largest": float(model["size"].max()),
+        "plants": int(table.member.max()),
+        "bandwidth": entry(sources.metrics["identify_plant"], "bandwidth_rad_s"),
+        "origin": page.origin(sources.source("poles")),
+    }
 
 
 def _constant(size: float, step: float) -> float:
