@@ -11,7 +11,7 @@ from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import THIN, band, count, decimals, number, short
 from pipeline.verdict.evidence import Absent, Table, gap_of, known, lookup, need, need_figure, or_empty
 from pipeline.verdict.identification import Fit, fit_figure, flagged_remedy, flagged_sentence
-from pipeline.verdict.verdict import Missing
+from pipeline.verdict.verdict import Figure, Missing
 
 MOST_INPUTS = 7  # panels in a row of a matrix; a machine with more shows the strongest
 
@@ -101,18 +101,17 @@ def fit_table(sources: Sources, fits: Sequence[Fit]) -> dict[str, Any]:
         )
         for fit in fits
     ]
-    both = [(fit.name, fit.simulated, free) for fit, free, _ in rows if not gap_of(fit.simulated)]
-    known_pairs = [pair for pair in both if not gap_of(pair[2])]
-    gains = {
-        name: f"{number(free.value - simulated.value, 1)} points"
-        for name, simulated, free in known_pairs
-        if free.low > simulated.high
-    }
+    gains, compared = {}, []
+    for fit, free, _ in rows:
+        if isinstance(fit.simulated, Figure) and isinstance(free, Figure):
+            compared.append(fit.name)
+            if free.low > fit.simulated.high:
+                gains[fit.name] = f"{number(free.value - fit.simulated.value, 1)} points"
     return {
         "rows": rows,
         "gains": gains,
         "moved": [f"{gain} in {name}" for name, gain in gains.items()],
-        "compared": [name for name, *_ in known_pairs],
+        "compared": compared,
         "known": any(not gap_of(free) for _, free, _ in rows),
     }
 
