@@ -18,8 +18,8 @@ from pipeline.report.shared.difference import Move
 from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.deposition import NAMES, NOT_JUDGED, OURS, Structure, data_driven, gamma, structures
-from pipeline.verdict.digits import THIN, number, percent, short
-from pipeline.verdict.evidence import Table, gap_of, known, lookup, need, need_figure, or_empty
+from pipeline.verdict.digits import THIN, number, short
+from pipeline.verdict.evidence import Table, entry, gap_of, known, lookup, need, need_figure, or_empty
 from pipeline.verdict.verdict import Missing, Question, count_of
 
 WORDS = (
@@ -258,23 +258,11 @@ def assumptions(sources: Sources) -> dict[str, Any]:
     tests = pd.DataFrame(checks, columns=["assumption", "claim", "material", "percent"])
     by_claim = tests.set_index(["assumption", "claim", "material"])["percent"].astype(float)
     measured = by_claim.unstack(sort=False).iloc[:, :MATERIALS]
-    rows = []
-    for (place, claim), percents in measured.iterrows():
-        name, _, what = claim.partition(": ")
-        cells = [
-            {"text": "not tested" if math.isnan(value) else percent(value, 2), "bad": value > limit}
-            for value in percents
-        ]
-        rows.append(
-            {
-                "number": place,
-                "name": name,
-                "what": what,
-                "cells": cells,
-                "holds": not any(cell["bad"] for cell in cells),
-            }
-        )
-    return {"rows": rows, "materials": list(measured.columns), "limit": f"{limit:g}{THIN}%"}
+    rows = [
+        (place, *claim.partition(": ")[::2], percents.tolist())
+        for (place, claim), percents in measured.iterrows()
+    ]
+    return {"rows": rows, "materials": list(measured.columns), "limit": limit}
 
 
 @as_table()
@@ -282,39 +270,20 @@ def chains(sources: Sources) -> dict[str, Any]:
     """Parameters of each machine: as known beforehand, as identified,
     and, where it is simulated, as it truly is."""
     learned, models = need_figure(sources.tables["learned"], "materials"), need(sources.tables["models"])
-    heads, values = [], []
-    for material in learned[:MATERIALS]:
-        name = str(material["material"])
-        nominal, true = (models.get(name, {}).get(key) for key in ("nominal", "plant"))
-        for word, extruder in (
-            ("beforehand", nominal),
-            ("identified", material["chain"]["extruder"]),
-            ("true", true),
-        ):
-            if extruder:
-                heads.append({"material": name, "word": word})
-                values.append(extruder)
-    fits = [
-        f"{material['material']}: on trials that it was not fitted to the chain misses "
-        f"{percent(material['chain']['held_out_percent'], 2)} of the flow’s movement"
+    machines = [
+        (str(material["material"]), word, extruder)
         for material in learned[:MATERIALS]
-        if material["chain"].get("held_out_percent") is not None
+        for word, extruder in (
+            ("beforehand", entry(models, material["material"], "nominal")),
+            ("identified", material["chain"]["extruder"]),
+            ("true", entry(models, material["material"], "plant")),
+        )
+        if extruder
     ]
-    return {
-        "rows": [
-            {
-                "title": title,
-                "cells": [
-                    "none" if extruder.get(key) is None else short(float(extruder[key]), 3)
-                    for extruder in values
-                ],
-            }
-            for key, title in CHAIN
-            if any(extruder.get(key) for extruder in values)
-        ],
-        "heads": heads,
-        "fit": "; ".join(fits),
-    }
+    rows = [(key, title) for key, title in CHAIN if any(one.get(key) for *_, one in machines)]
+    fitted = {material["material"]: material["chain"].get("held_out_percent") for material in learned}
+    missed = {name: share for name, share in list(fitted.items())[:MATERIALS] if share is not None}
+    return {"machines": machines, "rows": rows, "missed": missed}
 
 
 @or_empty
