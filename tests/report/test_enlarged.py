@@ -7,7 +7,7 @@ import pytest
 
 WIDTHS = (1280, 390)
 # a chart with two axes of numbers, one of them logarithmic in the second; every one has more panels behind it
-NUMBERED = (("temperature", "typical"), ("deposition", "learning-error"), ("temperature", "record"))
+NUMBERED = (("setpoint", "reliability"), ("deposition", "learning-error"), ("temperature", "record"))
 
 # each label of an axis: its text, what the chart's own scale says of the place of its tick, its box on the
 # screen, and the size of its letters

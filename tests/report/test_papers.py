@@ -15,7 +15,7 @@ from pipeline.papers import setpoint as papers_setpoint
 from pipeline.papers import temperature as papers_temperature
 from pipeline.papers.study import exact_gains
 from pipeline.papers.study_draws import read_published
-from pipeline.report.papers import page, rows, setpoint
+from pipeline.report.papers import derived, page, rows
 from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS
 from pipeline.report.shared.sources import Sources
 from pipeline.store import params
@@ -209,14 +209,14 @@ def test_the_confusion_of_the_classes_is_counted_in_percent_of_the_true_class():
         "named": np.array([0, 1, 1, 0]),
         "temperature_degC": np.array([190.4, 209.0, 211.0, 189.0]),
     }
-    heads, shares = setpoint._confusion(table)
+    heads, shares = derived.confusion(table)
     assert heads[1:] == ["insufficient", "optimal", "excessive"]
     assert shares == [
         ["insufficient", "50", "50", "0"],
         ["optimal", "0", "100", "0"],
         ["excessive", "100", "0", "0"],
     ]
-    heads, right = setpoint._by_temperature(table)
+    heads, right = derived.by_temperature(table)
     assert heads[1:] == ["190 °C", "210 °C"]
     assert right == [["insufficient", "100", "0"], ["optimal", "", "100"], ["excessive", "0", ""]]
 

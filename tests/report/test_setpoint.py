@@ -8,12 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.report.setpoint import agent as setpoint_agent
-from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
-from pipeline.setpoint import tables
 from pipeline.setpoint.agents.criteria import harm_bar
-from pipeline.setpoint.simulation.simulator import reward
 from pipeline.setpoint.tables import CLASSIFIED, PATHS
 from pipeline.store import artifacts, params
 from pipeline.verdict import setpoint as setpoint_verdict
@@ -24,9 +20,7 @@ from tests.report.test_pages import Page, change, figures
 
 PAGE, INDEX = Path("reports/setpoint.html"), Path("reports/index.html")
 ARTIFACTS = [
-    *(f"datasets/train_classifier/{name}" for name in ("classified.parquet", "reliability.parquet",
-    "course.parquet", "windows.parquet", "frames/frames.json")),
-    "datasets/papers/train_agent/agents.parquet",
+    *(f"datasets/train_classifier/{name}" for name in ("reliability.parquet", "frames/frames.json")),
     *(f"datasets/evaluate_setpoint/{name}" for name in ("scoreboard.parquet", "paths.parquet",
     "decisions.parquet", "choice.json")),
 ]  # fmt: skip
@@ -347,12 +341,9 @@ def test_the_page_says_whether_the_classifier_may_judge(project):
     assert f"The classifier: {said}." in page()
 
 
-def test_heads_of_few_own_pictures_have_no_learning_curve_and_no_yardsticks(project):
-    empty = {column.name: [] for column in tables.CLASSIFIER_CURVE.columns}
-    artifacts.write_table("datasets/train_classifier/course.parquet", tables.CLASSIFIER_CURVE, empty)
+def test_heads_of_few_own_pictures_have_no_yardsticks(project):
     change("train_classifier", svc_image_accuracy=None, width_image_accuracy=None)
     text = page()
-    assert "few own pictures train no network: only its last layer was fitted" in text
     assert "Vision transformer" in text and "Support vector machine" not in text
 
 
@@ -389,45 +380,7 @@ def test_without_figures_by_flow_the_page_says_so_and_the_rule_is_open(project):
     assert "Not measured" in section and '<svg class="plot' not in section
 
 
-# ---- the paper's agent
-
-
-def test_claims_of_the_paper_stand_beside_results_and_guesses_are_named(project):
-    page()
-    section = PAGE.read_text().split('aria-labelledby="claims"')[1].split("</section>")[0]
-    rows = [re.sub(r"<.*?>|\s+", " ", row).split() for row in section.split("<tr>")[1:]]
-    told = [" ".join(row) for row in rows]
-    assert any(row.endswith("rests at, flow 95 % 91 %") for row in told)
-    assert any("least flow once near 100 % 75 % never near 100 %" in row for row in told)
-    assert any("after phase 1" in row and "range of flow, second half not printed 0 %" in row for row in told)
-    text = " ".join(told)
-    assert "replay buffer, steps 131,072" in text and "limits of flow, % 20, 310" in text
-    assert "all four phases, judged with classes that are always right" in PAGE.read_text()
-
-
 # ---- the figures themselves
-
-
-def test_lines_of_equal_reward_have_that_reward():
-    for level in setpoint_agent.LEVELS:
-        q, u = setpoint_agent.equal_reward(level, a=20.0, b=10.0)
-        # float32 in the reward
-        np.testing.assert_allclose(reward(q, u, a=20.0, b=10.0), level, atol=1e-5)
-
-
-def test_windows_are_counted_right_by_the_class_of_their_flow():
-    p = np.array([[0.8, 0.2, 0.0], [0.5, 0.5, 0.0], [0.0, 0.1, 0.9], [0.0, 0.9, 0.1]])
-    mine = {
-        "flow_bin": np.array([0, 0, 1, 1]),
-        "flow_low_percent": np.array([80.0, 80.0, 110.0, 110.0]),
-        "flow_high_percent": np.array([90.0, 90.0, 120.0, 120.0]),
-        "named": np.array([0, 1, 2, 2]),
-    } | {f"p_{name}": p[:, k] for k, name in enumerate(("under", "good", "over"))}
-    flow, scaled, right = setpoint_vision._by_bin(mine)
-    np.testing.assert_allclose(flow, [85, 115])
-    np.testing.assert_allclose(right, [50, 100])
-    # divided by the largest of each window, then the mean
-    np.testing.assert_allclose(scaled[0], [1.0, (0.25 + 1) / 2, 0.0])
 
 
 def test_stretches_of_held_windows_end_where_the_reason_changes():

@@ -31,8 +31,6 @@ def render_off(sources: Sources) -> str:
 
 
 ANOTHER = "The accepted run is of another machine: nothing to compare."
-# figures of a loop that page one names
-NAMED = 2
 
 
 class LoopChange(NamedTuple):
@@ -42,16 +40,6 @@ class LoopChange(NamedTuple):
     loop: str
     moved: Sequence[str]
     of: int
-
-    def sentence(self) -> str:
-        """ "2 of 18 figures moved: settled error +0.39 °C · worse; ..."."""
-        if not self.of:
-            return "nothing to compare with."
-        if not self.moved:
-            return f"no figure of {self.of} moved beyond its noise."
-        more = f"; and {len(self.moved) - NAMED} more" if len(self.moved) > NAMED else ""
-        listed = "; ".join(self.moved[:NAMED])
-        return f"{len(self.moved)} of {count(self.of, 'figure')} moved: {listed}{more}."
 
 
 class Changes(NamedTuple):

@@ -4,19 +4,15 @@ and the files that leave the house."""
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from pipeline.report.certificate import exported
-from pipeline.report.shared import charts, page, words
-from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture
+from pipeline.report.shared import page, words
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.controllers import BY_NAME, heading
-from pipeline.verdict.digits import number, with_unit
-from pipeline.verdict.evidence import Absent, entry, gap_of, known, need, need_figure, or_nothing
+from pipeline.verdict.controllers import BY_NAME
+from pipeline.verdict.digits import number
+from pipeline.verdict.evidence import gap_of, known, need, need_figure, or_nothing
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 
 WORDS = ("verdict", "margin_disk", "margin_delay", "spread", "step", "hash")
-MOST_BANDS = 40  # gains that are listed, those that are surest of all inputs first
 
 
 def render(sources: Sources, verdict: Verdict) -> str:
@@ -24,23 +20,26 @@ def render(sources: Sources, verdict: Verdict) -> str:
     lines = exported.lines(sources, verdict)
     shown = _certificate(sources, lines)
     whole = known(shown, None)
+    mine = next((line for line in known(lines, []) if line.loop == "temperature"), None)
     return page.render(
         "certificate.html",
         here="certificate",
         sources=sources,
         title="Certificate",
-        head=head(shown, lines),
+        no_lines=gap_of(lines),
+        state={PASSED: "passed", FAILED: "failed"}.get(mine.state, "open") if mine else "open",
+        mine=mine,
+        certificate=whole,
         missing_certificate=gap_of(shown),
-        rules=rule_rows(whole) if whole else [],
-        controllers=controllers(sources),
-        about=about(whole) if whole else [],
-        poles=poles(sources, shown),
+        controllers=sources.certified.get("temperature") or {},
+        known_names=BY_NAME,
+        figure=_figure,
+        poles=poles(shown),
         margins=margins(whole) if whole else [],
         judged_margins=judged_margins(sources),
-        bands=band_rows(whole) if whole else [],
         lines=known(lines, []),
         origin_of=page.origin(sources.source("certificate", "export_controllers")),
-        differences=differences(sources),
+        exports=known(sources.metrics.get("export_controllers") or {}, {}),
         words=words.chosen(sources, WORDS),
     )
 
@@ -56,66 +55,6 @@ def _certificate(
     return Missing(OPEN, why) if why else shown
 
 
-def head(
-    shown: Mapping[str, Any] | Missing, lines: Sequence[exported.ExportedLine] | Missing
-) -> dict[str, Any]:
-    """Passed or refused, and the first rule that failed."""
-    said: dict[str, Any] = {"state": "open", "decision": "No certificate.", "reason": "", "lead": ""}
-    said |= {"remedy": "", "claim": "", "changed": "", "rules": (), "heads": ()}
-    if gap := gap_of(lines):
-        return said | {"reason": gap.sentence()}
-    mine = next(line for line in known(lines, []) if line.loop == "temperature")
-    state = {PASSED: "passed", FAILED: "failed"}.get(mine.state, "open")
-    said |= {"state": state, "decision": mine.word, "reason": mine.why}
-    if gap_of(shown) or mine.state == OPEN:
-        return said
-    if mine.state == FAILED:
-        rule = str(entry(shown, "first_failed") or "").replace("_", " ")
-        return said | {"lead": f"First failed rule: {rule}.", "remedy": "Nothing of this loop is exported."}
-    limits = "It holds for this plant, these units and this sample time, and nothing else."
-    if entry(shown, "evidence") == "simulated":
-        limits += " The plant is simulated: not for a real machine."
-    return said | {"decision": f"{mine.word} {mine.name[:1].upper()}{mine.name[1:]}.", "reason": limits}
-
-
-def rule_rows(shown: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The rules in the order in which they were asked."""
-    rows = []
-    for rule in shown["rules"]:
-        found, limit = (_figure(rule.get(key), rule.get("unit") or "") for key in ("found", "limit"))
-        rows.append(
-            {
-                "name": rule["name"].replace("_", " "),
-                "state": OPEN if not rule.get("asked", True) else PASSED if rule["passed"] else FAILED,
-                "found": found,
-                "limit": f"{_side(rule)}{limit}",
-                "sentence": rule["sentence"],
-            }
-        )
-    return rows
-
-
-def controllers(sources: Sources) -> list[tuple[str, str, str]]:
-    """State, controller and reason: whether each controller of the temperature loop has a certificate."""
-    certified = sources.certified.get("temperature") or {}
-    return [
-        (
-            PASSED if one["passed"] else FAILED,
-            heading(name) if name in BY_NAME else name,
-            one["why"] or "Every rule of the certificate is passed.",
-        )
-        for name, one in certified.items()
-    ]
-
-
-def _side(rule: Mapping[str, Any]) -> str:
-    """On which side of its limit a figure passes: the one where it lies, or does not."""
-    found, limit = rule.get("found"), rule.get("limit")
-    if found is None or limit is None or found == limit or not rule.get("asked", True):
-        return ""
-    return "≥ " if (found > limit) == rule["passed"] else "≤ "
-
-
 def _figure(value: float | None, unit: str) -> str:
     """A number with its unit; empty where a rule counts nothing."""
     if value is None:
@@ -124,66 +63,15 @@ def _figure(value: float | None, unit: str) -> str:
     return text if unit in ("", "1") else f"{text} {unit.replace('degC', '°C')}"
 
 
-def about(shown: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What it was made for."""
-    name = shown["controller"]
-    learned, newest = shown["samples"]
-    return [
-        ("Controller", heading(name) if name in BY_NAME else name),
-        ("Evidence", shown["evidence"]),
-        ("Conditions", shown["conditions"]),
-        ("Sample time", with_unit(shown["sample_time_s"], "s", 2)),
-        *(
-            (side.capitalize(), "; ".join(_signal(one) for one in shown[side]))
-            for side in ("inputs", "outputs")
-        ),
-        ("Record", f"{learned} samples learned from, {newest} of the newest"),
-        *((f"SHA-256 of {key}", shown[f"{key}_sha256"]) for key in ("controller", "plant", "spread")),
-    ]
-
-
-def _signal(one: Mapping[str, Any]) -> str:
-    low, high = ("none" if one[side] is None else f"{one[side]:g}" for side in ("low", "high"))
-    return f"{one['name']} in {one['unit']}, {low} to {high}"
-
-
-@as_picture("poles", "Poles of the closed loop")
-def poles(sources: Sources, shown: Mapping[str, Any] | Missing) -> Picture:
-    """Closed-loop poles: of the model, of its spread and of what the record leaves open."""
-    shown = need(shown)
-    if not shown["poles"]:
-        raise Absent(Missing(OPEN, "An earlier rule refused, so that none was computed"))
-    largest = max(one["radius"] for one in shown["poles"])
-    columns = [
-        PictureColumn(name, small, "", [_circle(shown["poles"], near=near, largest=largest)])
-        for name, small, near in (
-            ("The unit circle", "real part right, imaginary part up", False),
-            ("The slowest", "enlarged", True),
-        )
-    ]
-    plants = len(shown["poles"])
-    text = f"On {plants} plants the largest pole is of size {number(largest, 4)}: "
-    text += "stable." if largest < 1 else "not stable."
-    caption = "Crosses: the identified model. Dots: plants of its spread, and of what the record leaves open."
-    return Picture(text, columns, caption, page.origin(sources.source("certificate")))
-
-
-def _circle(loops: Sequence[Mapping[str, Any]], *, near: bool, largest: float):
-    low, high, up = (0.8, 1.02, 0.12) if near else (-1.1, 1.1, 1.1)
-    frame = charts.Frame(
-        charts.linear(low, high, ticks=3), charts.linear(-up, up, ticks=3), width=270, height=256, above=6
-    )
-    layers = [charts.line(frame, *charts.inside(frame, *charts.CIRCLE), "lim line thin", most=181)]
-    for model in (False, True):
-        points = [pair for one in loops if (one["of"] == "model") == model for pair in one["poles"]]
-        if points:
-            real, imag = charts.inside(frame, *np.array(points, float).T)
-            layers.append(
-                charts.crosses(frame, real, imag) if model else charts.dots(frame, real, imag, "try", 1.7)
-            )
-    return charts.panel(
-        frame, layers, alt=f"{len(loops)} closed loops, the largest pole of size {number(largest, 4)}"
-    )
+@or_nothing
+def poles(shown: Mapping[str, Any] | Missing) -> str:
+    """The largest closed-loop pole over the model, its spread and what the record leaves open; "" if an
+    earlier rule refused."""
+    radii = [one["radius"] for one in need(shown)["poles"]]
+    if not radii:
+        return ""
+    stable = "stable" if max(radii) < 1 else "not stable"
+    return f"On {len(radii)} plants the largest pole is of size {number(max(radii), 4)}: {stable}."
 
 
 def margins(shown: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -220,40 +108,3 @@ def judged_margins(sources: Sources) -> str:
         f"test set, {plants} other plants: disk margin {disk[0]} of the weakest tenth and {disk[1]} of the "
         f"worst, delay margin {delay[0]} and {delay[1]}."
     )
-
-
-def band_rows(shown: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    """Gains whose bands are surest, the ones furthest from zero by their own width first."""
-    bands = shown.get("bands")
-    if not bands:
-        return []
-    gain, low, high = (np.array(bands[key], float) for key in ("gain", "low", "high"))
-    sure = np.abs(gain) / np.maximum(high - low, 1e-12)
-    order = np.argsort(-sure, axis=None, kind="stable")[:MOST_BANDS]
-    inputs = [one["name"] for one in shown["inputs"]]
-    columns = gain.shape[1]
-    at = [divmod(int(k), columns) for k in order]
-    return [
-        (inputs[i], str(bands["on"][j]), f"{gain[i, j]:.3g}", f"{low[i, j]:.3g} to {high[i, j]:.3g}")
-        for i, j in at
-    ]
-
-
-def differences(sources: Sources) -> list[tuple[str, str]]:
-    """How far what is exported is from what was judged."""
-    metrics = sources.metrics.get("export_controllers")
-    if not isinstance(metrics, Mapping):
-        return []
-    named = {
-        "judged": "the object against the judged commands of the deciding case",
-        "python": "the file of Python against the object, with limits, faults and hand-overs",
-        "log_flow": "log flow of the exported classifier against the network",
-    }
-    return [
-        (
-            f"{loop.capitalize()}: {named.get(name, name)}",
-            f"{value:.2g} {fields['unit'].replace('1', '')}".strip(),
-        )
-        for loop, fields in metrics.items()
-        for name, value in (fields.get("largest_difference") or {}).items()
-    ]

@@ -13,7 +13,7 @@ from pipeline.report.deposition.parts import real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
 from pipeline.report.shared.sources import Sources, first_routine
-from pipeline.verdict.digits import THIN, count, number, percent, short
+from pipeline.verdict.digits import THIN, number, percent, short
 from pipeline.verdict.evidence import Absent, Table, entry, known, lookup, need
 from pipeline.verdict.verdict import Missing
 
@@ -25,12 +25,6 @@ LAWS = {
 }
 # more materials than this, and the rest stands in the tables alone
 MATERIALS = 4
-# commands beyond this many times the steady one run along the edge
-REACH = 12.0
-
-
-def pictures(sources: Sources) -> list[Picture]:
-    return [errors(sources), commands(sources), corner(sources)]
 
 
 def _materials(table: Table) -> list[str]:
@@ -183,183 +177,6 @@ def _error_panel(
     )
 
 
-# ---- commands
-
-
-@as_picture("commands", "What the plunger is asked for")
-def commands(sources: Sources) -> Picture:
-    """What the plunger is asked for: first, second and last trial."""
-    table = need(sources.tables["lessons"])
-    materials = _materials(table)
-    there = set(table["law"].tolist())
-    law = next((name for name in ("model_inverse", "pixels") if name in there), None)
-    if law is None:
-        raise Absent(Missing("not measured", "no trial of the model inversion is there"))
-    last = int(_trials(table, materials[0], law)["trial"].max(initial=0))
-    peaks: list[str] = []
-
-    def draw(trial: int, column: int) -> list[Markup]:
-        panels = []
-        for i, material in enumerate(materials):
-            first, mine = (_trial(table, material, law, k) for k in (0, trial))
-            if not len(mine["time_s"]):
-                continue
-            wanted = first["wanted_mm3_per_s"]
-            u = mine["command_mm"] / float(np.median(first["command_mm"][wanted > 0.9 * wanted.max()]))
-            if trial == last:
-                peaks.append(f"{material} {number(float(np.abs(u).max()), 0)} times")
-            name = f"Trial {trial}, material {material}"
-            panels.append(
-                _command_panel(mine["time_s"], u, name, material, column == i == 0, i == len(materials) - 1)
-            )
-        return panels
-
-    heads = {0: "on\u2011off control", 1: "after one update", last: "the last"}
-    shown = [
-        PictureColumn(f"Trial {trial}", heads[trial], "", draw(trial, i))
-        for i, trial in enumerate(dict.fromkeys((0, min(1, last), last)))
-    ]
-    return Picture(
-        f"At the end the command peaks at {', '.join(peaks)} the steady one: a push at every start, "
-        "a pull at every stop. A drive that gives less needs longer ramps.",
-        shown,
-        "Plunger command of the model inversion, in multiples of the steady command, against time in s. "
-        f"Beyond ± {REACH:g} it runs along the edge.",
-        page.origin(
-            sources.source("lessons"),
-            material=materials,
-            routine=_routines(table),
-            law=law,
-            trial=sorted({"0", str(min(1, last)), str(last)}),
-            y="command_mm",
-        ),
-    )
-
-
-def _command_panel(
-    time_s: np.ndarray, u: np.ndarray, name: str, material: str, titled: bool, bottom: bool
-) -> Markup:
-    """One command, in multiples of the steady one, against time."""
-    end, peak = float(time_s[-1]), float(np.abs(u).max())
-    y = charts.Axis(-REACH, REACH, ((-10.0, "−10"), (0.0, "0"), (10.0, "10")))
-    frame = charts.Frame(
-        charts.linear(0, end, ticks=5), y, 368, 132 if bottom else 120, 30, 16 if bottom else 6
-    )
-    text = f"material {material}: peak {short(peak, 2)} ×"
-    return charts.panel(
-        frame,
-        [charts.line(frame, time_s, u, most=500), charts.label(frame, end, 10, text, anchor="end")],
-        alt=f"{name}: the command peaks at {short(peak, 2)} times the steady one",
-        css="dd",
-        title="× steady" if titled else "",
-        x_ticks=bottom,
-        units=("s", "×"),
-    )
-
-
-# ---- the corner, before and after
-
-
-def _pause(trial: Table) -> tuple[float, float]:
-    """Begin and end of the pause of a routine: the gap in its wanted flow."""
-    on = np.flatnonzero(trial["wanted_mm3_per_s"] > 0.02 * trial["wanted_mm3_per_s"].max())
-    gaps = np.flatnonzero(np.diff(on) > 1)
-    if not len(gaps):
-        middle = float(trial["time_s"][on[len(on) // 2]])
-        return middle, middle
-    return float(trial["time_s"][on[gaps[0]]]), float(trial["time_s"][on[gaps[0] + 1]])
-
-
-@as_picture("corner", "Flow around the corner, before and after learning")
-def corner(sources: Sources) -> Picture:
-    """Wanted and true flow around the pause, before and after."""
-    table = need(sources.tables["lessons"])
-    materials, laws = _materials(table), _laws(table)
-    kind = "measured_mm3_per_s" if real(sources) else "true_mm3_per_s"
-    # the worse material's error, in % of a full line's flow: of on-off control, and after learning by a law
-    errors: dict[str, float] = {}
-
-    def draw(law: str, column: int) -> list[Markup]:
-        panels = []
-        for i, material in enumerate(materials):
-            trials = _trials(table, material, law or laws[-1])["trial"]
-            if not len(trials):
-                continue
-            mine = _trial(table, material, law or laws[-1], int(trials.max()) if law else 0)
-            error, panel = _corner_panel(
-                mine, mine[kind], law, material, column == i == 0, i == len(materials) - 1
-            )
-            errors[law] = max(errors.get(law, 0.0), error)
-            panels.append(panel)
-        return panels
-
-    shown = [
-        PictureColumn("On\u2011off control", "before learning: trial 0", "baseline", draw("", 0)),
-        *(PictureColumn(*LAWS[law][:2], LAWS[law][3], draw(law, i)) for i, law in enumerate(laws, 1)),
-    ]
-    after = [
-        f"{LAWS[law][0][:1].lower()}{LAWS[law][0][1:]} {percent(errors[law], 2)}"
-        for law in laws
-        if law in errors
-    ]
-    before = errors.get("")
-    return Picture(
-        f"Through the corner on\u2011off control misses the wanted flow by {percent(before or 0.0, 2)} of a "
-        f"full line; after the last trial: {', '.join(after)}, the worse material each.",
-        shown,
-        f"{'Measured' if real(sources) else 'True'} flow in mm³/s against time since the gantry’s pause "
-        "began, in s; dashed: wanted.",
-        page.origin(
-            sources.source("lessons"),
-            material=materials[:1],
-            routine=_routines(table),
-            law=laws,
-            trial=sorted(
-                {str(int(_trials(table, materials[0], law)["trial"].max(initial=0))) for law in laws}
-            ),
-            y=kind,
-        ),
-    )
-
-
-def _corner_panel(
-    mine: Table, flow: np.ndarray, law: str, material: str, titled: bool, bottom: bool
-) -> tuple[float, Markup]:
-    """r.m.s. error in % of a full line's flow around the pause, and the flow drawn beside the wanted one,
-    after learning by a law; before it if there is none."""
-    begin, end = _pause(mine)
-    near = (mine["time_s"] >= begin - 1.0) & (mine["time_s"] <= end + 1.5)
-    t, flow, wanted = mine["time_s"][near] - begin, flow[near], mine["wanted_mm3_per_s"][near]
-    top = 1.45 * float(wanted.max())
-    frame = charts.Frame(
-        charts.linear(-1.0, end - begin + 1.5, ticks=4),
-        charts.linear(0, top, ticks=3),
-        270,
-        128 if bottom else 116,
-        26,
-        16 if bottom else 6,
-    )
-    error = 100 * float(np.sqrt(np.nanmean((flow - wanted) ** 2))) / float(wanted.max())
-    text = f"material {material}: {percent(error, 2)} off"
-    layers = [
-        charts.line(frame, t, wanted, "ref"),
-        charts.line(frame, t, flow),
-        charts.label(frame, frame.x.high, top, text, anchor="end", dy=8),
-    ]
-    when = f"After learning, {LAWS[law][0]}" if law else "Before learning, on-off control"
-    panel = charts.panel(
-        frame,
-        layers,
-        alt=f"{when}, material {material}: the flow misses the wanted one by {percent(error, 2)} of a full "
-        "line, r.m.s.",
-        css=LAWS[law][2] if law else "bl",
-        title="mm³/s" if titled else "",
-        x_ticks=bottom,
-        units=("s", "mm³/s"),
-    )
-    return error, panel
-
-
 # ---- what the camera saw
 
 
@@ -370,25 +187,7 @@ def frames(sources: Sources) -> dict[str, Any]:
     # the corner tells most, then what was rejected
     order = {"start": 0, "steady line": 1, "corner": 2, "rejected": 3}
     rows = sorted(pictures, key=lambda row: (row["material"], row["trial"], order.get(row["place"], 9)))
-    return {"shown": [_frame(row) for row in rows], "origin": page.origin(sources.source("frames"))}
-
-
-def _frame(row: dict[str, Any]) -> dict[str, Any]:
-    """A row of the index of frames, in words."""
-    of, at = f"aterial {row['material']}, trial {row['trial']}", number(row["time_s"], 2)
-    if row["reason"]:
-        figure = judged = f"rejected: {row['reason']}"
-    else:
-        width = number(row["width_mm"], 3)
-        figure, judged = f"{width}{THIN}mm wide", f"the bead’s edges found, {width} mm apart"
-    return {
-        "uri": Markup("{}").format(row["uri"]),
-        "head": f"M{of}, {row['place']}",
-        "figure": figure,
-        "bad": bool(row["reason"]),
-        "foot": (row["recording"], f"{row['topic']} at {at}{THIN}s"),
-        "alt": f"Frame of m{of}, at {at} s, {judged}",
-    }
+    return {"shown": rows, "origin": page.origin(sources.source("frames"))}
 
 
 @as_picture("told", "The flow that the pictures told")
@@ -518,7 +317,7 @@ def _measured_panels(mine: Table, wide: float, name: str, machine: bool, *, titl
     ]
 
 
-@as_table(untold="")
+@as_table(untold=[])
 def camera(sources: Sources) -> dict[str, Any]:
     """By material: frames read and rejected, uncertainty, and what the calibration left."""
     filmed, models = need(sources.tables["filmed"]), sources.tables["models"]
@@ -531,58 +330,26 @@ def camera(sources: Sources) -> dict[str, Any]:
         observable=("observable", "mean"),
         outliers=("outliers", "sum"),
     )  # fmt: skip
-    rows = [_filmed(row, models, sources) for row in by_material.itertuples()]
-    return {"rows": rows, "untold": ", ".join(row["material"] for row in rows if row["untold"])}
+    rows = [row | _told(sources, row["material"]) for row in by_material.reset_index().to_dict("records")]
+    for row in rows:
+        row["calibration"] = entry(models, row["material"], "calibration")
+    untold = [row["material"] for row in rows if any(late["s"] is None for late in row["latencies"])]
+    given = entry(sources.declared.everything, "camera", "latency_s") is not None
+    return {"rows": rows, "untold": untold, "given": given}
 
 
-def _filmed(row: Any, models: dict[str, Any] | Missing, sources: Sources) -> dict[str, Any]:
-    """One material's sums, in words."""
-    latency, untold = _latency(sources, row.Index)
-    return {
-        "material": row.Index,
-        "trials": count(row.trials, "trial"),
-        "frames": number(row.frames, 0),
-        "rejected": f"{number(row.rejected, 0)} ({percent(100 * row.rejected / max(row.frames, 1), 2)})",
-        "why": row.reasons,
-        "deviation": f"{short(1000 * row.deviation, 2)}{THIN}·10⁻³ mm³/s",
-        "observable": percent(100 * row.observable, 3),
-        "outliers": number(row.outliers, 0),
-        "calibration": _calibration(models, row.Index),
-        "latency": latency,
-        "untold": untold,
-        "delay": _delay(sources, row.Index),
-    }
-
-
-def _latency(sources: Sources, material: str) -> tuple[str, bool]:
-    """How late the camera is against the gantry, with its 90 % interval, of each routine that was learned
-    through pictures; and whether the pictures of one do not tell it, so that nothing was corrected."""
+def _told(sources: Sources, material: str) -> dict[str, Any]:
+    """How late the camera is against the gantry, of each routine that was learned through pictures, and the
+    identified delay from plunger to flow, which is not the camera's; both in s, None if not told."""
     laws = known(sources.metrics["train_ilc"], {}).get(material, {})
-    figures = [
-        figures for law, figures in laws.items() if law.startswith("pixels") and "latency_s" in figures
+    latencies = [
+        {"s": figures["latency_s"], "deviation_s": figures.get("latency_deviation_s")}
+        for law, figures in laws.items()
+        if law.startswith("pixels") and "latency_s" in figures
     ]
-    untold = any(each["latency_s"] is None for each in figures)
-    given = sources.declared.everything.get("camera", {}).get("latency_s") is not None
-    texts = [_late(each["latency_s"], each.get("latency_deviation_s"), given) for each in figures]
-    return "; ".join(dict.fromkeys(texts)) or "not measured", untold
-
-
-def _late(latency_s: float | None, deviation_s: float | None, given: bool) -> str:
-    if latency_s is None:
-        return "not told: declare camera.latency_s"
-    late = 1000 * latency_s
-    if given or deviation_s is None:
-        return f"{number(late, 1)}{THIN}ms, as declared"
-    wide = 1645 * deviation_s
-    return f"{number(late, 1)}{THIN}ms ({number(late - wide, 1)} to {number(late + wide, 1)})"
-
-
-def _delay(sources: Sources, material: str) -> str:
-    """The identified delay from plunger to flow, which is not the camera's."""
     learned = known(lookup(sources.tables["learned"], "materials"), [])
     chain = next((one["chain"] for one in learned if one["material"] == material), {})
-    delay_s = entry(chain, "extruder", "delay_s")
-    return "not measured" if delay_s is None else f"{number(1000 * delay_s, 0)}{THIN}ms"
+    return {"latencies": latencies, "delay_s": entry(chain, "extruder", "delay_s")}
 
 
 def _reasons(texts: Iterable[str]) -> str:
@@ -592,15 +359,3 @@ def _reasons(texts: Iterable[str]) -> str:
         name, _, frames = reason.rpartition(" ")
         frames_of[name] += int(frames) if frames.isdigit() else 1
     return ", ".join(f"{name} {number(frames, 0)}" for name, frames in sorted(frames_of.items())) or "none"
-
-
-def _calibration(models: dict[str, Any] | Missing, material: str) -> str:
-    """Scale of a calibration and what it left, in um and px."""
-    calibration = entry(models, material, "calibration")
-    if calibration is None:
-        return "as recorded"
-    gain, deviation = calibration["gain"], calibration["deviation"]
-    return (
-        f"{number(1000 * gain, 3)}{THIN}µm/px, residual {number(1000 * deviation, 2)}{THIN}µm "
-        f"({number(deviation / gain, 2)}{THIN}px)"
-    )

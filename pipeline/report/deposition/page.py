@@ -3,7 +3,6 @@ what that took, and the pictures behind it."""
 
 import itertools
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,23 +14,13 @@ from pipeline.report.deposition import learning as deposition_learning
 from pipeline.report.deposition import parts as deposition_parts
 from pipeline.report.deposition.parts import HEADS, KIND, MARK, PAPER, real
 from pipeline.report.shared import charts, headline, page, words
-from pipeline.report.shared.difference import Change, Move
+from pipeline.report.shared.difference import Move
 from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.deposition import (
-    NAMES,
-    NOT_JUDGED,
-    OURS,
-    Score,
-    Structure,
-    data_driven,
-    gamma,
-    structures,
-)
-from pipeline.verdict.digits import THIN, number, percent, short
-from pipeline.verdict.evidence import Table, gap_of, known, lookup, need, need_figure, or_empty
-from pipeline.verdict.settings import ReportRules
-from pipeline.verdict.verdict import Figure, Missing, Question
+from pipeline.verdict.deposition import NAMES, NOT_JUDGED, OURS, Structure, data_driven, gamma, structures
+from pipeline.verdict.digits import THIN, number, short
+from pipeline.verdict.evidence import Table, entry, gap_of, known, lookup, need, need_figure, or_empty
+from pipeline.verdict.verdict import Missing, Question, count_of
 
 WORDS = (
     "on_off",
@@ -72,7 +61,8 @@ SECTIONS = ("printer", "camera", "train_ilc", "segment_library", "compose_parts"
 def render(sources: Sources) -> str:
     """The text of deposition.html."""
     judged, parts = sources.verdicts["deposition"], structures(sources.evidence)
-    measured = known(parts, [])
+    measured, lessons = known(parts, []), known(sources.tables["lessons"], None)
+    rule = data_driven(measured)
     return page.render(
         "deposition.html",
         here="deposition",
@@ -82,15 +72,22 @@ def render(sources: Sources) -> str:
         heads_of_rules=_heads_of_rules(judged.winner),
         claim=headline.claim(sources, ("deposition",)),
         verdict_mark=MARK.get(judged.winner, "model_based"),
-        beforehand=_beforehand(sources),
+        before=gamma(sources.evidence),
+        routines=sorted(set(lessons["routine"].tolist()) - {0}) if lessons else [],
+        laws=known(sources.metrics["train_ilc"], {}),
         real=real(sources),
         no_scores=gap_of(parts),
         answers=[
-            _answer(part, move, data_driven(measured))
+            _answer(part, move, rule)
             for part, move in itertools.zip_longest(measured, deposition_card.moves(sources, measured))
         ],
-        scoreboard=scoreboard(measured, sources.declared.rules),
-        learning=deposition_learning.pictures(sources),
+        board=BOARD,
+        composers=NAMES,
+        marks=MARK,
+        methods=PAPER,
+        rules=sources.declared.rules,
+        structures=measured,
+        learning=deposition_learning.errors(sources),
         frames=deposition_learning.frames(sources),
         measured=deposition_learning.measured(sources),
         camera=deposition_learning.camera(sources),
@@ -102,11 +99,8 @@ def render(sources: Sources) -> str:
         maps=deposition_parts.maps(sources),
         stretches=deposition_parts.stretches(sources),
         by_prints=deposition_parts.by_prints(sources),
-        library={
-            "rule": NAMES[data_driven(measured)],
-            "mark": MARK[data_driven(measured)],
-            "compared": any(one.error(data_driven(measured)) is not None for one in measured),
-        },
+        library=rule,
+        compared=any(one.error(rule) is not None for one in measured),
         lines=deposition_parts.lines(sources),
         forecasts=deposition_parts.forecasts(sources),
         extruded=deposition_parts.extruded(sources),
@@ -127,147 +121,22 @@ def _heads_of_rules(winner: str) -> tuple[str, ...]:
     return HEADS[0], NAMES[winner], MARK[winner], HEADS[3]
 
 
-def _beforehand(sources: Sources) -> str:
-    before, lessons = gamma(sources.evidence), known(sources.tables["lessons"], None)
-    other = sorted(set(lessons["routine"].tolist()) - {0}) if lessons else []
-    instead = f"Shown is routine {other[0]}: the reference is not recorded. " if other else ""
-    instead += _floor(sources)
-    if before is None:
-        return (
-            f"{instead}The convergence of the paper’s law was not tested beforehand; the model inversion "
-            "identifies the machine in its first trials, and returns to the best command if the error rises."
-        )
-    return (
-        f"{instead}Tested before anything ran: with γ = max |Q² (1 − L P)| below 1 the paper’s law shrinks "
-        f"the error at every trial. γ is {number(before['gamma'], 2)} on the nominal plant and up to "
-        f"{number(before['gamma_worst'], 2)} over its family, above 1 on "
-        f"{percent(before['gamma_above_1_percent'], 2)} of it: there the law may look fine for a dozen "
-        "trials and then diverge. "
-        "The model inversion identifies the machine in its first trials; its γ counts what its model leaves "
-        "of them, too. If the error rises, it goes a smaller share of its way from the best command; if the "
-        "best command itself gives a larger error, the machine has changed, and it learns anew."
-    )
-
-
-def _floor(sources: Sources) -> str:
-    """Another kind of machine than printer.command says, and the least error that the declared drive allows,
-    the worst of materials and routines."""
-    materials = known(sources.metrics["train_ilc"], {})
-    ratios = [
-        headroom["least_ratio"]
-        for material in materials.values()
-        for headroom in material.get("actuator_headroom", [])
-    ]
-    named = "".join(
-        f"Material {name}: {material['command_kind']}. "
-        for name, material in materials.items()
-        if material.get("command_kind")
-    )
-    if not ratios:
-        return named
-    return named + (
-        f"No command within printer.drive leaves less than {percent(100 * max(ratios), 2)} of on-off "
-        "control’s error, says the model known beforehand (worst routine). "
-    )
-
-
 # ---- the first screen: a row for each structure and material
 
 
 def _answer(structure: Structure, move: Move | None, library: str) -> dict[str, Any]:
-    """The basis functions beside the library's better rule on one scale, the strip's limit in its middle; the
-    worst line's volume of the composer that was chosen."""
+    """The basis functions beside the library's better rule on one scale, the strip's limit in its middle."""
     scores, limit = structure.known(), structure.asked.flow_error_percent
     question = Question(0, "", structure.part, "%", limit, False, "")
+    gap = Missing("not measured", "no score")
     shown = [
-        (
-            NAMES[name],
-            css,
-            Figure(*3 * (scores[name].error,)) if name in scores else Missing("not measured", "no score"),
-        )
+        (NAMES[name], css, count_of(scores[name].error) if name in scores else gap)
         for name, css in ((OURS, "mb"), (library, "dd"), ("ilc", "acc"))
     ]
-    chosen = scores.get(structure.chosen)
-    line = chosen.worst_line if chosen else None
-    best = structure.best()
-    return {
-        "part": structure.part,
-        "material": structure.material,
-        "state": structure.state(),
-        "cells": [
-            {
-                "css": css,
-                "name": NAMES[name],
-                "value": _value(structure, name),
-                "band": _interval(scores[name]) if name in scores else "",
-                "bad": name in scores and scores[name].error > limit,
-                "best": name == best,
-            }
-            for css, name in (("mb", OURS), ("dd", library))
-        ],
-        "whole": percent(scores["ilc"].error, 2) if "ilc" in scores else "none",
-        "strip": charts.strip(question, shown, (9, 25, 17)),
-        "line": NOT_JUDGED if structure.unknown() else "no line" if line is None else f"±{percent(line, 2)}",
-        "line_bad": line is not None and line > structure.asked.line_volume_percent,
-        "change": Change("first run")
-        if move is None
-        else Change(move.text(), move.moved, move.word == "worse"),
-    }
-
-
-def _value(structure: Structure, name: str) -> str:
-    """The flow error of a composer; of a real machine no figure that its forecast does not stand behind."""
-    error = structure.error(name)
-    if error is None:
-        return NOT_JUDGED if name in structure.scores else "not measured"
-    return percent(error, 2)
-
-
-def _interval(score: Score) -> str:
-    """The 90 % interval of the forecast beside a figure, as short as a band of the other pages."""
-    if score.predicted is None or (score.judged and (score.low is None or score.high is None)):
-        return ""
-    return f"{number(score.low, 2)}–{number(score.high, 2)}" if score.judged else NOT_JUDGED
+    return {"structure": structure, "move": move, "strip": charts.strip(question, shown, (9, 25, 17))}
 
 
 BOARD = ("basis", "priority", "superposition", "pressure_advance", "pressure_advance_lead", "on_off", "ilc")
-
-
-def scoreboard(parts: list[Structure], asked: ReportRules) -> dict[str, Any]:
-    """True error, what was forecast, and the worst line's volume."""
-    return {
-        "heads": [{"mark": MARK[name], "name": NAMES[name], "method": PAPER[name]} for name in BOARD],
-        "rows": [
-            {"part": part.part, "material": part.material, "cells": [_cell(part, name) for name in BOARD]}
-            for part in parts
-        ],
-        "limit": f"{asked.flow_error_percent:g}{THIN}%",
-        "line": f"±{asked.line_volume_percent:g}{THIN}%",
-    }
-
-
-def _cell(structure: Structure, name: str) -> dict[str, Any]:
-    score = structure.known().get(name)
-    if score is None:
-        return {
-            "value": _value(structure, name),
-            "band": "",
-            "line": "",
-            "best": False,
-            "bad": False,
-            "line_bad": False,
-            "chosen": name in structure.scores and name == structure.chosen,
-        }
-    line, asked = score.worst_line, structure.asked
-    return {
-        "value": _value(structure, name),
-        "band": _interval(score),
-        "line": "no line long enough" if line is None else f"worst line {percent(line, 2)}",
-        "best": name == structure.best(),
-        "bad": score.error > asked.flow_error_percent and name != "on_off",
-        "line_bad": line is not None and line > asked.line_volume_percent and name != "on_off",
-        "chosen": name == structure.chosen,
-    }
 
 
 def declared(sources: Sources) -> list[tuple[str, list[tuple[str, str]]]]:
@@ -389,23 +258,11 @@ def assumptions(sources: Sources) -> dict[str, Any]:
     tests = pd.DataFrame(checks, columns=["assumption", "claim", "material", "percent"])
     by_claim = tests.set_index(["assumption", "claim", "material"])["percent"].astype(float)
     measured = by_claim.unstack(sort=False).iloc[:, :MATERIALS]
-    rows = []
-    for (place, claim), percents in measured.iterrows():
-        name, _, what = claim.partition(": ")
-        cells = [
-            {"text": "not tested" if math.isnan(value) else percent(value, 2), "bad": value > limit}
-            for value in percents
-        ]
-        rows.append(
-            {
-                "number": place,
-                "name": name,
-                "what": what,
-                "cells": cells,
-                "holds": not any(cell["bad"] for cell in cells),
-            }
-        )
-    return {"rows": rows, "materials": list(measured.columns), "limit": f"{limit:g}{THIN}%"}
+    rows = [
+        (place, *claim.partition(": ")[::2], percents.tolist())
+        for (place, claim), percents in measured.iterrows()
+    ]
+    return {"rows": rows, "materials": list(measured.columns), "limit": limit}
 
 
 @as_table()
@@ -413,43 +270,24 @@ def chains(sources: Sources) -> dict[str, Any]:
     """Parameters of each machine: as known beforehand, as identified,
     and, where it is simulated, as it truly is."""
     learned, models = need_figure(sources.tables["learned"], "materials"), need(sources.tables["models"])
-    heads, values = [], []
-    for material in learned[:MATERIALS]:
-        name = str(material["material"])
-        nominal, true = (models.get(name, {}).get(key) for key in ("nominal", "plant"))
-        for word, extruder in (
-            ("beforehand", nominal),
-            ("identified", material["chain"]["extruder"]),
-            ("true", true),
-        ):
-            if extruder:
-                heads.append({"material": name, "word": word})
-                values.append(extruder)
-    fits = [
-        f"{material['material']}: on trials that it was not fitted to the chain misses "
-        f"{percent(material['chain']['held_out_percent'], 2)} of the flow’s movement"
+    machines = [
+        (str(material["material"]), word, extruder)
         for material in learned[:MATERIALS]
-        if material["chain"].get("held_out_percent") is not None
+        for word, extruder in (
+            ("beforehand", entry(models, material["material"], "nominal")),
+            ("identified", material["chain"]["extruder"]),
+            ("true", entry(models, material["material"], "plant")),
+        )
+        if extruder
     ]
-    return {
-        "rows": [
-            {
-                "title": title,
-                "cells": [
-                    "none" if extruder.get(key) is None else short(float(extruder[key]), 3)
-                    for extruder in values
-                ],
-            }
-            for key, title in CHAIN
-            if any(extruder.get(key) for extruder in values)
-        ],
-        "heads": heads,
-        "fit": "; ".join(fits),
-    }
+    rows = [(key, title) for key, title in CHAIN if any(one.get(key) for *_, one in machines)]
+    fitted = {material["material"]: material["chain"].get("held_out_percent") for material in learned}
+    missed = {name: share for name, share in list(fitted.items())[:MATERIALS] if share is not None}
+    return {"machines": machines, "rows": rows, "missed": missed}
 
 
 @or_empty
-def slicer(sources: Sources) -> list[dict[str, str]]:
+def slicer(sources: Sources) -> list[dict[str, Any]]:
     """Pressure advance of each material as a slicer takes it, each number with its 90 % interval, and the
     lines that set it; no number of a material if no forecast of it is judged."""
     materials = need_figure(sources.tables["learned"], "slicer")
@@ -457,42 +295,20 @@ def slicer(sources: Sources) -> list[dict[str, str]]:
     judged = {stream.material for stream in streams if not stream.unknown()}
     unknown = {stream.material for stream in streams} - judged
     return [
-        {"material": name, "lines": NOT_JUDGED} | dict.fromkeys(SLICER, NOT_JUDGED)
+        {"material": name, "lines": NOT_JUDGED} | dict.fromkeys(SLICER)
         if name in unknown
         else {"material": name, "lines": "\n".join(f"{key}: {values[key]}" for key in SLICERS)}
-        | {key: _with_ends(values[key], places) for key, places in SLICER.items()}
+        | {key: [f"{one:.{places}f}" for one in values[key]] for key, places in SLICER.items()}
         for name, values in list(materials.items())[:MATERIALS]
     ]
-
-
-def _with_ends(values: Sequence[float], places: int) -> str:
-    low, value, high = (f"{one:.{places}f}" for one in values)
-    return f"{value} ({low} to {high})"
 
 
 @as_table()
 def columns(sources: Sources) -> dict[str, Any]:
     """The matrix (3), a row for each of its columns."""
     table = need(sources.tables["library"])
-    library = pd.DataFrame(table)
+    rows = pd.DataFrame(table).head(MOST).to_dict("records")
+    for row in rows:
+        row["extreme"] = max(row["signal_mm"], key=abs, default=0.0)
     Ts = float(known(lookup(sources.tables["learned"], "sample_time_s"), math.nan))
-    return {
-        "rows": [_signal(row, Ts) for row in library.head(MOST).itertuples()],
-        "more": max(len(library) - MOST, 0),
-    }
-
-
-def _signal(row: Any, Ts: float) -> dict[str, Any]:
-    """A row of the library, sampled every Ts seconds."""
-    command = np.asarray(row.signal_mm, float)
-    extreme = float(command[np.argmax(np.abs(command))]) if len(command) else 0.0
-    return {
-        "task": row.task,
-        "material": row.material,
-        "nozzle": f"{row.nozzle_mm:g}",
-        "speed": f"{row.speed_mm_per_s:g}",
-        "pause": f"{row.pause_s:g}" if row.pause_s else "",
-        "lead": f"{number(Ts * row.lead, 2)} ({row.lead})",
-        "length": f"{number(Ts * row.length, 2)} ({row.length})",
-        "extreme": short(extreme, 3) if extreme else "0",
-    }
+    return {"rows": rows, "Ts": Ts, "more": max(len(table["task"]) - MOST, 0)}

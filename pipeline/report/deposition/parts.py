@@ -24,8 +24,8 @@ from pipeline.verdict.deposition import (
     structures,
     unknown_streams,
 )
-from pipeline.verdict.digits import MINUS, THIN, count, number, percent, short
-from pipeline.verdict.evidence import Absent, Table, instead, known, need
+from pipeline.verdict.digits import THIN, count, percent, short
+from pipeline.verdict.evidence import Absent, Table, entry, instead, known, need
 from pipeline.verdict.verdict import Missing
 
 # parts and streams that are drawn; the others stand in the tables
@@ -399,35 +399,13 @@ def lines(sources: Sources) -> dict[str, Any]:
     table = _judged(sources, "lines")
     allowed = sources.declared.rules.line_volume_percent
     printed = pd.DataFrame(table).fillna({"error_percent": 0.0})
-    printed["off_percent"] = printed.error_percent.abs()
-    beyond, short_runs = int((printed.off_percent > allowed).sum()), int(printed.shorter_than_lead.sum())
+    off = printed.error_percent.abs()
     return {
-        "rows": [
-            {
-                "part": row.part,
-                "line": row.line,
-                "tool": f"T{row.tool}",
-                "duration": number(row.duration_s, 2),
-                "planned": number(row.planned_mm3, 3),
-                "predicted": number(row.predicted_mm3, 3),
-                "on_off": _signed(100 * (row.on_off_mm3 / max(row.planned_mm3, 1e-12) - 1)),
-                "error": _signed(row.error_percent),
-                "bad": row.off_percent > allowed,
-                "short": row.shorter_than_lead,
-            }
-            for row in printed.nlargest(WORST, "off_percent").itertuples()
-        ],
-        "summary": f"Of {count(len(printed), 'line')}, "
-        f"{'none is' if not beyond else count(beyond, 'is', 'are')} "
-        f"predicted more than {allowed:g}{THIN}% off {'its' if beyond <= 1 else 'their'} volume; "
-        f"{count(short_runs, 'belongs', 'belong') if short_runs else 'none belongs'} to runs shorter than "
-        "the lead of Stop.",
+        "rows": printed.loc[off.nlargest(WORST).index].to_dict("records"),
+        "of": len(printed),
+        "beyond": int((off > allowed).sum()),
+        "short": int(printed.shorter_than_lead.sum()),
     }
-
-
-def _signed(value: float) -> str:
-    text = percent(abs(value), 2)
-    return f"{MINUS if value < 0 else '+'}{text}"
 
 
 # ---- what limits a part, and what was refused
@@ -440,65 +418,22 @@ def forecasts(sources: Sources) -> dict[str, Any]:
     unknown, parts = unknown_streams(sources.evidence), known(structures(sources.evidence), [])
     # the verdict gives the reason of the first; here it would stand again
     said = next((part.why for part in parts if part.unknown()), "")
-    return {
-        "rows": [
-            _forecast(part, material, report, (part, material) in unknown, said)
-            for part, report in conformance.items()
-            for material in report.get("saturation", {})
-        ]
-    }
-
-
-def _forecast(part: str, material: str, report: dict[str, Any], unknown: bool, said: str) -> dict[str, Any]:
-    """One stream out of the conformance report of its part: what it comes to, with 90 % certainty, and what
-    it asks of the drive; no figure of the flow if that is unknown, and no reason that is already said."""
-    drive = report["saturation"][material]
-    asked = asked_of_the_drive(part, material, drive)
-    ramp = report.get("ramp_that_would_do_s", {}).get(material)
-    composer = report.get("composer", {}).get(material, "")
-    if drive["enough"]:
-        remedy = "as it is"
-    else:
-        remedy = "none would do" if ramp is None else f"{number(float(ramp), 2)}{THIN}s"
-    interval, why, measured = _told(report.get("forecast", {}).get(material), said)
-    error = _beside(drive.get("rms_percent_of_on_off"), drive.get("least_percent"))
-    return {
-        "part": part,
-        "material": material,
-        "mark": MARK.get(composer, "baseline"),
-        "composer": NAMES.get(composer, composer),
-        "interval": interval,
-        "why": why,
-        "measured": measured,
-        "time": number(float(report.get("duration_s", 0.0)), 1),
-        "lines": f"{report.get('printed_lines', 0):,} in {report.get('runs', 0):,}",
-        "short": number(float(report.get("shorter_than_lead", 0)), 0),
-        "peak": f"{short(asked.command_mm, 2)} ({short(float(drive['peak_over_steady']), 2)} ×)",
-        "speed": short(asked.speed_mm_per_s, 2),
-        "limit": "not declared" if asked.limit() == "declared" else asked.limit(),
-        "share": percent(asked.share, 2),
-        "bad": not asked.enough,
-        "error": NOT_JUDGED if unknown else error,
-        "ramp": remedy,
-    }
-
-
-def _beside(error: float | None, least: float | None) -> str:
-    """A flow error, and in brackets the least that any command within the drive leaves."""
-    return "" if error is None else percent(error, 2) + ("" if least is None else f" ({percent(least, 2)})")
-
-
-def _told(forecast: dict[str, Any] | None, said: str) -> tuple[str, str, str]:
-    """The forecast interval, or why it is not judged and what would judge it; and what was measured."""
-    if forecast is None:
-        return "none", "", ""
-    measured = forecast.get("measured_percent")
-    beside = "" if measured is None else f"measured {percent(float(measured), 2)}"
-    if not forecast["judged"]:
-        repeated = forecast["reason"] == said
-        why = "" if repeated else f"{forecast['reason']}; to judge it, {forecast['trial']}"
-        return NOT_JUDGED, why, beside
-    return f"{percent(forecast['low'], 2)} to {percent(forecast['high'], 2)}", "", beside
+    rows = [
+        {
+            "part": part,
+            "material": material,
+            "report": report,
+            "drive": drive,
+            "asked": asked_of_the_drive(part, material, drive),
+            "unknown": (part, material) in unknown,
+            "forecast": entry(report, "forecast", material),
+            "composer": entry(report, "composer", material) or "",
+            "ramp": entry(report, "ramp_that_would_do_s", material),
+        }
+        for part, report in conformance.items()
+        for material, drive in report.get("saturation", {}).items()
+    ]
+    return {"rows": rows, "said": said}
 
 
 @as_table()
@@ -512,33 +447,9 @@ def extruded(sources: Sources) -> dict[str, Any]:
     rows, shares = [], []
     for part, program in told:
         found = {f"T{one['tool']}": one for one in program["e_beside_declared_bead"]}
-        rows += [_tool(part, tool, source, found.get(tool)) for tool, source in program["volumes"].items()]
+        rows += [(part, tool, source, found.get(tool)) for tool, source in program["volumes"].items()]
         shares += [one["by_e_mm3"] / one["declared_mm3"] for one in found.values() if one["declared_mm3"] > 0]
-    if not shares:
-        return {
-            "rows": rows,
-            "summary": "No line’s volume is E’s: each is its length times the declared bead’s area.",
-        }
-    times = " to ".join(dict.fromkeys(short(share, 3) for share in (min(shares), max(shares))))
-    return {
-        "rows": rows,
-        "summary": f"E gives the volumes of {len(shares)} of {count(len(rows), 'tool')}; it asks for "
-        f"{times} times the declared bead’s.",
-    }
-
-
-def _tool(part: str, tool: str, source: str, one: dict[str, Any] | None) -> dict[str, str]:
-    """What one tool of a part presses out, by E and by the declared bead."""
-    named = {"part": part, "tool": tool, "source": source}
-    if one is None:
-        return named | {"by_e": "not told", "declared": "", "difference": "", "area": ""}
-    by_e, declared, (low, middle, high) = one["by_e_mm3"], one["declared_mm3"], one["area_mm2"]
-    return named | {
-        "by_e": short(by_e, 4),
-        "declared": short(declared, 4),
-        "difference": _signed(100 * (by_e / declared - 1)) if declared > 0 else "",
-        "area": f"{short(low, 3)} to {short(high, 3)}, half of the length below {short(middle, 3)}",
-    }
+    return {"rows": rows, "shares": shares}
 
 
 @as_table()

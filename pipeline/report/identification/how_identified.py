@@ -8,30 +8,12 @@ import numpy as np
 
 from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.digits import THIN, band, count, decimals, listed, number, short
-from pipeline.verdict.evidence import (
-    Absent,
-    Table,
-    gap_of,
-    instead,
-    known,
-    lookup,
-    need,
-    need_figure,
-    or_empty,
-)
-from pipeline.verdict.identification import (
-    Fit,
-    band_of,
-    fit_figure,
-    flagged_remedy,
-    flagged_sentence,
-    percent_of,
-)
+from pipeline.verdict.digits import THIN, band, count, decimals, number, short
+from pipeline.verdict.evidence import Absent, Table, gap_of, known, lookup, need, need_figure, or_empty
+from pipeline.verdict.identification import Fit, fit_figure, flagged_remedy, flagged_sentence
 from pipeline.verdict.verdict import Figure, Missing
 
 MOST_INPUTS = 7  # panels in a row of a matrix; a machine with more shows the strongest
-LEAST_P = 1e-6  # smaller ones are all the same to a reader
 
 REFINED = {
     "subspace": "none, the subspace fit stands",
@@ -52,57 +34,17 @@ def loop_state(sources: Sources) -> dict[str, Any]:
     if not p_values:
         reason = "the record is noise-free: it holds no errors that an input could answer"
         raise Absent(Missing("not applicable", reason))
-    level = tested.get("level", 0.0)
-    if tested["closed"]:
-        answering = [name for name, p in p_values.items() if p < level] or [min(p_values, key=p_values.get)]
-        largest = max(p_values[name] for name in answering)
-        test = (
-            f"{listed(answering)} {'answers' if len(answering) == 1 else 'answer'} past errors of the "
-            f"outputs ({_p(largest)}), as a controller does."
-        )
-        return {
-            "closed": True,
-            "head": "Recorded in closed loop.",
-            "test": test,
-            "follows": _closed_follows(sources),
-        }
-    nearest = min(p_values, key=p_values.get)
-    threshold = f"; feedback is called below {short(level, 2)}" if level else ""
-    test = (
-        f"No input is seen to answer past errors of the outputs: least {_p(p_values[nearest])}, "
-        f"{nearest}{threshold}."
-    )
+    nearest, level = min(p_values, key=p_values.get), tested.get("level", 0.0)
+    answering = [name for name, p in p_values.items() if p < level] or [nearest]
     return {
-        "closed": False,
-        "head": "No feedback was recognised.",
-        "test": test,
-        "follows": "The model is identified as from an open loop. A weak proportional controller whose "
-        "set-point never moves stays below this test: where the machine had one, believe the fit some steps "
-        "ahead before the simulation.",
+        "closed": tested["closed"],
+        "level": level,
+        "nearest": nearest,
+        "least": p_values[nearest],
+        "answering": answering,
+        "largest": max(p_values[name] for name in answering),
+        "fit": known(lookup(sources.metrics["identify_plant"], "fit"), ""),
     }
-
-
-def _closed_follows(sources: Sources) -> str:
-    fitted = lookup(sources.metrics["identify_plant"], "fit")
-    if fitted == "simulation":
-        how = (
-            "identify_plant.refinement asks for a fit to simulated outputs all the same, which feedback "
-            "biases: set it to validated."
-        )
-    else:
-        how = (
-            "The model was therefore identified in predictor form (PBSID), which feedback does not bias, and "
-            "judged one step ahead as well, without feed-through and without fits to simulated outputs."
-        )
-    return (
-        "Noise of the outputs is then in the inputs, and a fit to simulated outputs bends towards the "
-        f"inverse of the controller. {how} The fit in simulation on the hold-out flatters. Set-point steps "
-        "or a small dither on each input make the next record surer."
-    )
-
-
-def _p(value: float) -> str:
-    return "p below 0.000001" if value < LEAST_P else f"p = {short(value, 2)}"
 
 
 # ---- gains that physics forbids
@@ -119,49 +61,23 @@ def flagged(sources: Sources) -> dict[str, Any]:
     if not heaters:
         reason = "no input is declared to heat, so no sign is known to be wrong"
         raise Absent(Missing("not applicable", reason, "Set heats: true for heaters in plant.inputs"))
-    finding = f"None: every effect of {listed(heaters)} is one that a heater can have."
-    if gains:
-        finding = f"{flagged_sentence(gains)} {flagged_remedy(gains)}"
-    return {"finding": finding, "rows": [_flagged_row(gain) for gain in gains]}
-
-
-def _flagged_row(gain: dict[str, Any]) -> dict[str, Any]:
-    places = decimals(gain["low"], gain["high"], value=gain["gain"])
-    return {
-        "output": gain["output"],
-        "input": gain["input"],
-        "gain": number(gain["gain"], places),
-        "band": band(gain["low"], gain["high"], places),
-        "reason": gain["reason"],
-        "certain": gain["certain"],
-    }
+    finding = f"{flagged_sentence(gains)} {flagged_remedy(gains)}" if gains else ""
+    rows = [gain | {"places": decimals(gain["low"], gain["high"], value=gain["gain"])} for gain in gains]
+    return {"finding": finding, "heaters": heaters, "rows": rows}
 
 
 # ---- what was chosen
 
 
-def chosen_rows(sources: Sources) -> list[tuple[str, str]]:
-    """What the record decided beside the order: (choice, outcome)."""
-    metrics, step = sources.metrics["identify_plant"], sources.declared.machine.sample_time_s
-    past, fitted, direct = (lookup(metrics, key) for key in ("past", "fit", "feedthrough"))
-    rows = [
-        ("Past horizon", past, lambda: f"{count(past, 'sample')}, {past * step:g}{THIN}s"),
-        ("Direct feed-through", direct, lambda: _feedthrough(direct)),
-        ("Refinement", fitted, lambda: REFINED.get(fitted, fitted)),
-        ("Validation", lookup(metrics, "validation"), lambda: left_out_words(sources)),
-    ]
-    disturbances = [signal.name for signal in sources.declared.machine.disturbances]
-    return [
-        *((name, gap.state if (gap := gap_of(value)) else words()) for name, value, words in rows),
-        ("Measured disturbances", ", ".join(disturbances) or "none declared (plant.disturbances)"),
-    ]
-
-
-def _feedthrough(direct: dict[str, bool]) -> str:
-    outputs = [name for name, free in direct.items() if free]
-    return (
-        f"{listed(outputs)}, {len(outputs)} of {count(len(direct), 'output')}" if outputs else "in no output"
-    )
+def chosen(sources: Sources) -> dict[str, Any]:
+    """What the record decided beside the order, each with a Missing if it is not known."""
+    metrics = sources.metrics["identify_plant"]
+    return {
+        **{key: lookup(metrics, key) for key in ("past", "fit", "feedthrough", "validation")},
+        "refined": REFINED,
+        "left_out": left_out_words(sources),
+        "machine": sources.declared.machine,
+    }
 
 
 def left_out_words(sources: Sources) -> str:
@@ -177,44 +93,28 @@ def left_out_words(sources: Sources) -> str:
 def fit_table(sources: Sources, fits: Sequence[Fit]) -> dict[str, Any]:
     """Every output with and without a free mean: what another ambient or operating point costs."""
     metrics = sources.metrics["identify_plant"]
-    rows = []
-    for fit in fits:
-        free = fit_figure(metrics, "fit_holdout_free_mean", fit.name)
-        direct = lookup(metrics, f"feedthrough.{fit.name}")
-        cost, sure = _cost(fit.simulated, free)
-        cells = {
-            key: (percent_of(value), band_of(value))
-            for key, value in (("simulated", fit.simulated), ("free", free), ("ahead", fit.ahead))
-        }
-        words = gap.state if (gap := gap_of(direct)) else "yes" if direct else "no"
-        rows.append(
-            {"name": fit.name, "cost": cost, "sure": sure, "known": not gap_of(free), "feedthrough": words}
-            | cells
+    rows = [
+        (
+            fit,
+            fit_figure(metrics, "fit_holdout_free_mean", fit.name),
+            lookup(metrics, f"feedthrough.{fit.name}"),
         )
-    moved = [f"{row['cost']} in {row['name']}" for row in rows if row["sure"]]
-    if moved:
-        finding = (
-            f"A free mean gains {listed(moved)}: the level moved up to the hold-out, as another ambient or "
-            "operating point moves it. Record what does so as one of plant.disturbances."
-        )
-    elif any(row["known"] for row in rows):
-        finding = "A free mean gains nothing beyond noise: the level did not move up to the hold-out."
-    else:
-        finding = ""
-    return {"finding": finding, "rows": rows}
+        for fit in fits
+    ]
+    gains, compared = {}, []
+    for fit, free, _ in rows:
+        if isinstance(fit.simulated, Figure) and isinstance(free, Figure):
+            compared.append(fit.name)
+            if free.low > fit.simulated.high:
+                gains[fit.name] = f"{number(free.value - fit.simulated.value, 1)} points"
+    return {
+        "rows": rows,
+        "gains": gains,
+        "moved": [f"{gain} in {name}" for name, gain in gains.items()],
+        "compared": compared,
+        "known": any(not gap_of(free) for _, free, _ in rows),
+    }
 
-
-@instead(lambda gap: ("not measured", False))
-def _cost(simulated: Figure | Missing, free: Figure | Missing) -> tuple[str, bool]:
-    """Points that a free mean gains, and whether the bands are apart."""
-    simulated, free = need(simulated), need(free)
-    if free.low <= simulated.high:
-        return "within noise", False
-    return f"{number(free.value - simulated.value, 1)} points", True
-
-
-# Klipper's pid_Kp, pid_Ki and pid_Kd are of a duty of 0 to 255, ours of one in percent
-KLIPPER_FROM_PERCENT = 2.55
 
 # rows of an output with more inputs than a matrix shows: the page has a size to keep
 FEW_INPUTS = 4
@@ -222,8 +122,9 @@ FEW_INPUTS = 4
 
 def heater_table(sources: Sources) -> dict[str, Any]:
     """Every pair of the first-order table with a PID beside it, and the PID that the printer has."""
-    printer, note = _printer_rows(sources, sources.tables["first_order"])
-    return {"printer": printer, "printer_note": note} | _pairs(sources)
+    own = known(lookup(sources.tables["printer_pid"], "heaters"), [])
+    printer = [(pid, _simc(sources.tables["first_order"], pid)) for pid in own]
+    return {"printer": printer} | _pairs(sources)
 
 
 @as_table(finding="", outputs=[])
@@ -301,36 +202,9 @@ def _banded(table: Table, key: str, k: int) -> dict[str, str]:
 # ---- the printer's own
 
 
-@instead(lambda gap: ([], ""))
-def _printer_rows(sources: Sources, table: Table | Missing) -> tuple[list[dict[str, Any]], str]:
-    """The printer's PID of each heater over the one by SIMC, and how both are to be read."""
-    own = need_figure(sources.tables["printer_pid"], "heaters")
-    rows = []
-    for pid in own:
-        pair = f"{pid['input']} to {pid['output']}"
-        rows.append(_pid_row(pair, "the printer’s own", [pid[key] for key in ("Kp", "Ki", "Kd")]))
-        rows.append(_pid_row(pair, "SIMC, from this record", _simc(table, pid)))
-    logs = ", ".join(sorted({pid["recording"] for pid in own}))
-    note = (
-        "Klipper’s PID is parallel too; its pid_Kp, pid_Ki, pid_Kd are of a duty of 0 to 255, 2.55 times "
-        "those in percent. Its derivative acts on the temperature, smoothed over "
-        f"{own[0]['smooth_s']:g}{THIN}s, and its duty ends at {own[0]['most_percent']:g}{THIN}%. "
-        f"From the configuration in {logs}."
-    )
-    return rows, note
-
-
 @or_empty
 def _simc(table: Table | Missing, pid: dict[str, Any]) -> list[float]:
     table = need(table)
     k = np.flatnonzero((table["output"] == pid["output"]) & (table["input"] == pid["input"]))
     gains = [float(table[key][k[0]]) for key in ("Kp", "Ki", "Kd")] if len(k) else []
     return gains if np.isfinite(gains).all() else []
-
-
-def _pid_row(pair: str, whose: str, gains: list[float]) -> dict[str, Any]:
-    """A PID of a heater in percent of duty, and as printer.cfg has it."""
-    percent, klipper = (
-        [short(gain * scale) for gain in gains] or ["none"] * 3 for scale in (1, KLIPPER_FROM_PERCENT)
-    )
-    return {"pair": pair, "whose": whose, "gains": percent, "klipper": klipper}

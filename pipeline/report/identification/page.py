@@ -2,16 +2,13 @@
 pictures behind it, and what the record lost on the way."""
 
 import math
-from collections.abc import Mapping
 from typing import Any
-
-import numpy as np
 
 from pipeline.report.identification import how_identified, pictures
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.digits import MINUS, THIN, count, number, percent, quantity, short
+from pipeline.verdict.digits import MINUS, count, number
 from pipeline.verdict.evidence import (
     entry,
     gap_of,
@@ -20,9 +17,8 @@ from pipeline.verdict.evidence import (
     lookup,
     need,
     need_figure,
-    or_empty,
     or_gap,
-    or_nothing,
+    or_none,
 )
 from pipeline.verdict.identification import Fit, ahead_words, band_of, fit_figure, fits, least_fit, percent_of
 from pipeline.verdict.verdict import FAILED, PASSED, UNDECIDED, Figure, Missing, Question, Verdict, state
@@ -65,15 +61,15 @@ def render(sources: Sources) -> str:
         flagged=how_identified.flagged(sources),
         by_output=how_identified.fit_table(sources, judged_fits),
         heaters=how_identified.heater_table(sources),
-        chosen_rows=how_identified.chosen_rows(sources),
+        chosen=how_identified.chosen(sources),
+        band_of=band_of,
+        percent_of=percent_of,
         holdout=pictures.holdout(sources, judged_fits, ahead),
         white=pictures.whiteness(sources),
         cross=pictures.cross(sources),
         steps=pictures.steps(sources),
         order=pictures.order(sources),
-        candidates=candidates(sources),
         poles=pictures.poles(sources),
-        pole_rows=pictures.pole_table(sources),
         excitation=pictures.excitation(sources),
         planned=next_experiment(sources),
         from_planned=sources.source("generate_probing"),
@@ -87,16 +83,15 @@ def render(sources: Sources) -> str:
     )
 
 
-@or_nothing
-def _judged_on(sources: Sources) -> str:
+@or_none
+def _judged_on(sources: Sources) -> dict[str, Any]:
+    """The share of every stretch that the model is judged on, and the samples held out, of all."""
     metrics = sources.metrics["identify_plant"]
-    share = need_figure(sources.declared.everything, "identify_plant.holdout_share")
-    held, samples = need_figure(metrics, "samples_holdout"), need_figure(metrics, "samples")
-    return (
-        f"Judged on the last {100 * share:g}{THIN}% of every stretch, "
-        f"{number(held, 0)} of {number(samples, 0)} samples, by the model of the rest. "
-        "The model that is handed on was then fitted to all of them, with the same choices."
-    )
+    return {
+        "share": need_figure(sources.declared.everything, "identify_plant.holdout_share"),
+        "held": need_figure(metrics, "samples_holdout"),
+        "samples": need_figure(metrics, "samples"),
+    }
 
 
 # ---- a row for each output
@@ -219,37 +214,6 @@ def _sentence(text: str) -> str:
 # ---- tables
 
 
-@or_empty
-def candidates(sources: Sources) -> list[dict[str, Any]]:
-    """The order table with its rule: what each order keeps, costs and leaves unexplained."""
-    table = need(sources.tables["order"])
-    tried = np.isfinite(table["error"])
-    chosen = int(table["order"][table["chosen"]][0]) if table["chosen"].any() else 0
-    last = max(chosen + 3, int(table["order"][tried].max()) if tried.any() else 0)
-    best = float(table["error"][tried].min()) if tried.any() else np.nan
-    rows = []
-    for k in np.flatnonzero(table["order"] <= last):
-        error, value, edge = (float(table[name][k]) for name in ("error", "singular_value", "noise_edge"))
-        above = 100 * (error / best - 1) if best > 0 else 0.0
-        rows.append(
-            {
-                "order": int(table["order"][k]),
-                "chosen": bool(table["chosen"][k]),
-                "value": short(value, 3),
-                "parameters": number(float(table["parameters"][k]), 0) if tried[k] else "",
-                "error": (
-                    quantity(100 * error, "%", 2)
-                    if tried[k]
-                    else "not tried"
-                    if value > edge
-                    else "within noise"
-                ),
-                "above": "" if not tried[k] else "the best" if above == 0 else percent(above, 2),
-            }
-        )
-    return rows
-
-
 @as_table(rows=[])
 def losses(sources: Sources) -> dict[str, Any]:
     """For each signal: samples, how many are masked, and what was flagged."""
@@ -258,19 +222,8 @@ def losses(sources: Sources) -> dict[str, Any]:
     rows = []
     for signal in [*sources.declared.machine.inputs, *sources.declared.machine.outputs]:
         masked, total = int(table[f"{signal.name}_masked"].sum()), len(table["time_s"])
-        mine = known(flags, {}).get(signal.name, {})
-        share = f" ({short(100 * masked / total, 2)}{THIN}%)" if masked else ""
-        rows.append(
-            {
-                "name": signal.name,
-                "samples": number(total, 0),
-                "masked": f"{number(masked, 0)}{share}",
-                "bad": masked > 0.1 * total,
-                "flags": ", ".join(f"{kind} {number(number_of, 0)}" for kind, number_of in mine.items())
-                or ("not measured" if gap_of(flags) else "none"),
-            }
-        )
-    return {"rows": rows}
+        rows.append((signal.name, total, masked, known(flags, {}).get(signal.name, {})))
+    return {"rows": rows, "judged": not gap_of(flags)}
 
 
 def used(sources: Sources) -> list[tuple[str, str]]:
@@ -297,83 +250,12 @@ def used(sources: Sources) -> list[tuple[str, str]]:
     return [*rows, ("Dead time found", ", ".join(late) or none)]
 
 
-@as_table(sentences=[], rows=[])
+@as_table()
 def next_experiment(sources: Sources) -> dict[str, Any]:
-    """Of the stage generate_probing."""
+    """What generate_probing says of the next experiment, and of the moves to add to a controller's."""
     metrics = sources.metrics["generate_probing"]
-    told, added = need_figure(metrics, "next_experiment"), need_figure(metrics, "closed_loop")
-    if not told["written"]:
-        why = f"No experiment is written: {_celsius(told['reason'])}."
-        return {"sentences": [why, _around(added)], "rows": []}
     return {
-        "sentences": [_played(told), _taught(told), _around(added)],
-        "rows": [
-            {
-                "output": output.name,
-                "target": _degrees(told["target_degC"].get(output.name)),
-                "forecast": _range(
-                    told["lowest_degC"].get(output.name), told["highest_degC"].get(output.name)
-                ),
-                "limits": _range(*(told["limit_degC"][output.name][end] for end in ("low", "high"))),
-            }
-            for output in sources.declared.machine.outputs
-            if output.name in told["limit_degC"]
-        ],
+        "told": need_figure(metrics, "next_experiment"),
+        "added": need_figure(metrics, "closed_loop"),
+        "outputs": [output.name for output in sources.declared.machine.outputs],
     }
-
-
-def _played(told: Mapping[str, Any]) -> str:
-    least, most = (pick(told["amplitude_percent"].values()) for pick in (min, max))
-    moves = short(most, 2) if least == most else f"{short(least, 2)} to {short(most, 2)}"
-    doubt = told.get("doubt")
-    doubted = (
-        ""
-        if doubt is None
-        else f", though input gains be wrong by {100 * doubt['input_gain']:g}{THIN}% and the ambient by "
-        f"{doubt['ambient_degC']:g}{THIN}°C"
-    )
-    return (
-        f"next_experiment.csv lasts {number(told['seconds'], 0)}{THIN}s, starts at the last recorded inputs, "
-        f"and moves each by {moves}{THIN}%. Every plant of the family stays within the limits{doubted}. "
-        "Start it only where the machine stands as the record left it, and stay beside it."
-    )
-
-
-def _taught(told: Mapping[str, Any]) -> str:
-    errors = [pair for pairs in told["expected_error_percent"].values() for pair in pairs.values()]
-    if not errors:
-        return "No pair of input and output is seen."
-    gain, pace = (max(pair[key] for pair in errors) for key in ("gain", "time_constant"))
-    return (
-        f"It would leave gains unknown by at most {short(gain, 2)}{THIN}% and time constants by "
-        f"{short(pace, 2)}{THIN}% (standard errors on first-order models, the worst of {len(errors)} pairs); "
-        f"rank {told['excitation_rank']} of {told['excitation_full_rank']}{_gap(told)}."
-    )
-
-
-def _gap(told: Mapping[str, Any]) -> str:
-    gap = told["expected_gap_percent"]
-    return "" if gap is None else f", expected gap of a controller {short(gap, 2)}{THIN}%"
-
-
-def _around(added: Mapping[str, Any]) -> str:
-    if not added["written"]:
-        return f"Nothing is written to add to a running controller: {_celsius(added['reason'])}."
-    return (
-        f"next_experiment_closed_loop.csv is to be added to the running controller's commands: up to "
-        f"{short(max(added['amplitude_percent'].values()), 2)}{THIN}%; around a PI the family stays between "
-        f"{short(min(added['lowest_degC'].values()), 3)} and "
-        f"{short(max(added['highest_degC'].values()), 3)}{THIN}°C."
-    )
-
-
-def _celsius(reason: str) -> str:
-    return reason.rstrip(".").replace(" degC", f"{THIN}°C")
-
-
-def _degrees(value: float | None) -> str:
-    return "" if value is None else short(value, 3)
-
-
-def _range(low: float | None, high: float | None) -> str:
-    return "" if low is None or high is None else f"{short(low, 3)} to {short(high, 3)}"

@@ -1,20 +1,21 @@
 """The figures of the identification page that show the model's errors: on the
 hold-out, with themselves, and with the inputs."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.identification.how_identified import MOST_INPUTS, left_out_words, loop_state
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
 from pipeline.report.shared.sources import Sources
-from pipeline.verdict.digits import DASH, THIN, band, count, decimals, number, percent, short
-from pipeline.verdict.evidence import Table, entry, known, lookup, need, need_figure, or_empty
+from pipeline.verdict.digits import THIN, band, count, decimals, number, short
+from pipeline.verdict.evidence import Table, entry, known, lookup, need, need_figure
 from pipeline.verdict.identification import Fit, percent_of
-from pipeline.verdict.verdict import Missing
 
 
 class Room(NamedTuple):
@@ -40,8 +41,8 @@ def room(panels: int) -> Room:
 def as_matrix(id: str, title: str) -> Callable[[Callable[..., dict]], Callable[..., dict]]:
     """A decorator: a matrix of panels with its id and title; if it needs something that is absent, the
     reason."""
-    empty = {"finding": "", "rows": [], "caption": "", "origin": Markup(""), "across": 0}
-    named = {"id": id, "title": title}
+    empty = {"rows": [], "origin": Markup(""), "across": 0}
+    named = {"id": id, "title": title, "finding": "", "caption": "", "columns": []}
     return lambda draw: lambda sources: named | as_table(**empty)(draw)(sources)
 
 
@@ -283,9 +284,6 @@ def matrix(
     )
 
 
-MOST_DOTS = 600  # of the cloud of poles
-
-
 # ---- step responses
 
 
@@ -404,161 +402,49 @@ def _span(values: Sequence[float]) -> str:
 # ---- order and poles
 
 
-@as_picture("order", "How many states the record asks for")
-def order(sources: Sources) -> Picture:
-    """Singular values and the error of each order."""
-    table = need(sources.tables["order"])
-    shown = [singular(table), left_out(table)]
-    chosen = int(table["order"][table["chosen"]][0]) if table["chosen"].any() else 0
-    given = sources.declared.everything.get("identify_plant", {}).get("order") or 0
-    tried = np.isfinite(table["error"]).any()
-    tolerance = entry(sources.metrics["identify_plant"], "order_tolerance_percent")
-    near = "near the best" if tolerance is None else f"within {tolerance:g}{THIN}% of the best"
-    if given:
-        text = f"Order {chosen}, as identify_plant.order asks; the data were not asked."
-    elif tried:
-        text = f"Order {chosen}: the fewest free numbers whose error on what was left out is {near}."
-    else:
-        text = f"Order {chosen}: the record is noise-free, and its rank decides."
-    edge = short(float(table["noise_edge"][0]), 3)
-    caption = (
-        f"The rule: orders whose singular value rises above what noise alone reaches, {edge}, are tried; "
-        f"each is identified with {left_out_words(sources)} and simulated on it"
-        f"{', and predicted one step ahead' if loop_state(sources)['closed'] else ''}. "
-        f"Of those whose error is {near}, the one with the fewest free numbers wins. "
-        "Window, feed-through, order and refinement were chosen together."
-    )
-    return Picture(text, shown, caption if tried else "", page.origin(sources.source("order")))
+@as_matrix("order", "How many states the record asks for")
+def order(sources: Sources) -> dict[str, Any]:
+    """The orders with the rule that chose one: what each keeps, costs and leaves unexplained."""
+    table = pd.DataFrame(need(sources.tables["order"]))
+    tried = table.error.notna()
+    chosen = int(table.order[table.chosen].max()) if table.chosen.any() else 0
+    last = max(chosen + 3, int(table.order[tried].max()) if tried.any() else 0)
+    table["tried"], table["above"] = tried, (table.error / table.error.min() - 1).fillna(0.0)
+    return {
+        "rows": table[table.order <= last].to_dict("records"),
+        "chosen": chosen,
+        "given": sources.declared.everything.get("identify_plant", {}).get("order"),
+        "tried": bool(tried.any()),
+        "tolerance": entry(sources.metrics["identify_plant"], "order_tolerance_percent"),
+        "edge": float(table.noise_edge[0]),
+        "left_out": left_out_words(sources),
+        "closed": loop_state(sources)["closed"],
+        "origin": page.origin(sources.source("order")),
+    }
 
 
-@as_picture("poles", "Poles, and how surely they are known")
-def poles(sources: Sources) -> Picture:
-    """Poles of the model with the spread's cloud: the whole circle, and where they crowd."""
-    table = need(sources.tables["poles"])
-    mine = table["member"] == 0
-    others = np.flatnonzero(~mine)[:: max(1, -(-int((~mine).sum()) // MOST_DOTS))]
-    of_mine, extra = others[table["pole"][others] >= 0], others[table["pole"][others] < 0]
-    real, imag = table["real"], table["imag"]
-    size = np.hypot(real[mine], imag[mine])
-    slowest = float(size.max())
-    shown = []
-    for head, small, near in (
-        ("The unit circle", "real part right, imaginary part up", False),
-        ("Where they are", "enlarged, equal scales", True),
-    ):
-        frame = (
-            _window(real, imag, mine)
-            if near
-            else charts.Frame(
-                charts.linear(-1.1, 1.1, ticks=3),
-                charts.linear(-1.1, 1.1, ticks=3),
-                width=270,
-                height=256,
-                left=30,
-                above=6,
-            )
-        )
-        layers = (
-            [charts.line(frame, *charts.CIRCLE, "lim line thin", most=charts.CIRCLE.shape[1])]
-            if not near
-            else [_arc(frame)]
-        )
-        layers += [
-            charts.dots(frame, *charts.inside(frame, real[part], imag[part]), css, 1.7)
-            for part, css in ((extra, "try pale"), (of_mine, "try"))
-        ]
-        layers.append(charts.crosses(frame, real[mine], imag[mine]))
-        shown.append(
-            PictureColumn(
-                head,
-                small,
-                "",
-                [
-                    charts.panel(
-                        frame,
-                        layers,
-                        alt=f"{head}: {int(mine.sum())} poles, the largest of size {number(slowest, 4)}, "
-                        f"{'inside' if slowest < 1 else 'on or outside'} the unit circle",
-                    )
-                ],
-            )
-        )
-    plants = int(table["member"].max())
-    text = (
-        f"{count(int(mine.sum()), 'pole').capitalize()}, the largest of size {number(slowest, 4)}: "
-        f"{'stable' if slowest < 1 else 'not stable'}."
-    )
-    caption = (
-        f"Crosses: the model; dots: {count(plants, 'plant')} of the spread, each with one state more than "
-        "the model, whose pole is pale."
-    )
-    bandwidth = lookup(sources.metrics["identify_plant"], "bandwidth_rad_s")
-    if isinstance(bandwidth, float):
-        caption += (
-            f" Bandwidth by singular values: {short(bandwidth, 3)} rad/s, a time constant of "
-            f"{short(1 / bandwidth, 3)} s."
-        )
-    return Picture(text, shown, caption, page.origin(sources.source("poles")))
-
-
-def _window(real: np.ndarray, imag: np.ndarray, shown: np.ndarray) -> charts.Frame:
-    """The model's poles, nearly all of those of the spread that belong to them, and one, at equal scales."""
-    width, height, left = 420, 256, 46
-    low, high = float(np.quantile(real[shown], 0.02)), max(float(np.quantile(real[shown], 0.98)), 1.0)
-    wide, tall = width - left - 6, height - 22
-    half = max(0.6 * (high - low), 1.2 * float(np.quantile(np.abs(imag[shown]), 0.98)) * wide / tall, 2e-3)
-    middle, up = (low + high) / 2, half * tall / wide
-    return charts.Frame(
-        charts.linear(middle - half, middle + half, ticks=4),
-        charts.linear(-up, up, ticks=3),
-        width=width,
-        height=height,
-        left=left,
-        above=6,
-    )
-
-
-def _arc(frame: charts.Frame) -> Markup:
-    """The part of the unit circle that the frame shows, at the right."""
-    reach = np.arcsin(min(frame.y.high, 1.0))
-    angle = np.linspace(-reach, reach, 61)
-    inside = (np.cos(angle) >= frame.x.low) & (np.cos(angle) <= frame.x.high)
-    return charts.line(frame, np.cos(angle), np.where(inside, np.sin(angle), np.nan), "lim line thin")
-
-
-@or_empty
-def pole_table(sources: Sources) -> list[dict[str, str]]:
-    """Each pole of the model, a pair in one row: size, time constant
-    with its band over the spread, period."""
-    table, step = need(sources.tables["poles"]), sources.declared.machine.sample_time_s
-    rows = []
-    for k in np.flatnonzero((table["member"] == 0) & (table["imag"] >= 0)):
-        value = complex(table["real"][k], table["imag"][k])
-        others = (table["pole"] == table["pole"][k]) & (table["member"] > 0)
-        sizes = np.hypot(table["real"][others], table["imag"][others])
-        constant = _constant(abs(value), step)
-        low, high = (
-            np.sort([_constant(size, step) for size in np.quantile(sizes, [0.05, 0.95])])
-            if len(sizes)
-            else (np.nan, np.nan)
-        )
-        again = low <= constant <= high
-        rows.append(
-            {
-                "size": number(abs(value), 4),
-                "pair": "pair" if value.imag else "",
-                "constant": f"{short(constant, 3)}{THIN}s" if np.isfinite(constant) else "none",
-                "band": ""
-                if np.isnan(low + high)
-                else f"{short(low, 3)}{DASH}{short(high, 3)}"
-                if again
-                else "not found again",
-                "period": f"{short(2 * np.pi * step / abs(np.angle(value)), 3)}{THIN}s"
-                if value.imag or value.real < 0
-                else "",
-            }
-        )
-    return rows
+@as_matrix("poles", "Poles, and how surely they are known")
+def poles(sources: Sources) -> dict[str, Any]:
+    """Each pole of the model, a pair in one row: size, time constant with its 90 % band over the spread, and
+    period in s; how many poles and plants there are, the largest size, and the bandwidth."""
+    table, step = pd.DataFrame(need(sources.tables["poles"])), sources.declared.machine.sample_time_s
+    table["size"] = np.hypot(table["real"], table["imag"])
+    table["constant_s"] = [_constant(size, step) for size in table["size"]]
+    sizes = table[table.member > 0].groupby("pole")["size"]
+    ends = {pole: [_constant(end, step) for end in mine.quantile([0.05, 0.95])] for pole, mine in sizes}
+    model = table[table.member == 0]
+    rows = model[model["imag"] >= 0].to_dict("records")
+    for row in rows:
+        row["band"] = ends.get(row["pole"], [math.nan, math.nan])
+        row["period_s"] = 2 * math.pi * step / max(abs(math.atan2(row["imag"], row["real"])), 1e-300)
+    return {
+        "rows": rows,
+        "of": len(model),
+        "largest": float(model["size"].max()),
+        "plants": int(table.member.max()),
+        "bandwidth": entry(sources.metrics["identify_plant"], "bandwidth_rad_s"),
+        "origin": page.origin(sources.source("poles")),
+    }
 
 
 def _constant(size: float, step: float) -> float:
@@ -622,75 +508,4 @@ def excitation(sources: Sources) -> Picture:
         shown,
         "R.m.s. level in per cent within eight equal bands of frequency, 0 to π rad a sample.",
         page.origin(sources.source("levels")),
-    )
-
-
-# ---- orders, for the page of the identification
-
-
-_SMALL = {"width": 270, "height": 160, "left": 44}
-
-
-def singular(table: Table) -> PictureColumn:
-    """Singular values of the identification, by order."""
-    order, values, edge = table["order"], table["singular_value"], float(table["noise_edge"][0])
-    positive = np.append(values[values > 0], edge if edge > 0 else values.max())
-    frame = charts.Frame(
-        charts.linear(0, float(order[-1]) + 1),
-        charts.logarithmic(float(positive.min()), float(positive.max())),
-        **_SMALL,
-    )
-    chosen = table["chosen"]
-    last = int(order[chosen][0]) if chosen.any() else 0
-    layers = [
-        charts.dots(frame, order[order <= last], values[order <= last], "dot", 3),
-        charts.dots(frame, order[order > last], values[order > last], "try", 2.4),
-    ]
-    if edge > 0:
-        layers.append(charts.level(frame, edge, "lim", "noise alone"))
-    last_value = values[order == last]
-    size = short(float(last_value[0])) if len(last_value) else "none"
-    small = "of the identification, by order; log"
-    return PictureColumn(
-        "Singular values",
-        small,
-        "",
-        [
-            charts.panel(
-                frame,
-                layers,
-                alt=f"Order {last} is chosen: its singular value {size}, noise alone reaches {short(edge)}",
-                css="mb",
-            )
-        ],
-    )
-
-
-def left_out(table: Table) -> PictureColumn:
-    """The error of each order on what was left out."""
-    head, small = "Error of each order", "on blocks left out, share of the outputs’ variation"
-    compared = np.isfinite(table["error"])
-    if not compared.any():
-        gap = Missing("not applicable", "the rank alone decided, or the order was given")
-        return PictureColumn(head, small, "", [page.hole(gap)])
-    order, error, chosen = (table[name][compared] for name in ("order", "error", "chosen"))
-    frame = charts.Frame(
-        charts.linear(0, float(order[-1]) + 1), charts.linear(0, 1.1 * float(error.max())), **_SMALL
-    )
-    layers = [charts.line(frame, order, error), charts.dots(frame, order, error, "dot", 2.4)]
-    outcome = "none chosen"
-    if chosen.any():
-        at, least = float(order[chosen][0]), float(error[chosen][0])
-        layers += [
-            charts.dots(frame, [at], [least], "dot", 4),
-            charts.label(
-                frame, frame.x.high, frame.y.high, f"order {at:g}: {number(least, 3)}", anchor="end", dy=10
-            ),
-        ]
-        outcome = f"order {at:g} leaves {percent(100 * least, 2)} of the variation unexplained"
-    return PictureColumn(
-        head,
-        small,
-        "",
-        [charts.panel(frame, layers, alt=f"Error on left-out blocks by order: {outcome}", css="mb")],
     )

@@ -1,88 +1,110 @@
-"""Pieces of which the papers' figures are drawn again: several curves on one frame, and their caption."""
+"""The papers' figures drawn again from our data, as figures.toml describes them. Data are expressions of
+Jinja, words are its templates. Both know the paper's results, the axes and the functions of derived.py.
+"""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+import itertools
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.shared import charts
+from pipeline.report.papers import derived
+from pipeline.report.shared import charts, page
 
+FILE = Path(__file__).with_name("figures.toml")
 # of a picture, px: as wide as a phone, so that a text keeps its size there
 WIDTH, HEIGHT = 360, 200
 
 
-class PaperFigure(NamedTuple):
-    """A figure of a paper drawn from our data: its place there, what is seen, the panels, how to read them,
-    and a table of ours (heads, rows) where the figure is one."""
-
-    at: str
-    title: str
-    panels: list[Markup]
-    caption: str = ""
-    table: tuple[list[str], list[list[str]]] | None = None
-
-
-class PaperCurve(NamedTuple):
-    """x, y, class of the line, and its name at the right end."""
-
-    x: Sequence[float] | np.ndarray
-    y: Sequence[float] | np.ndarray
-    css: str = "line"
-    name: str = ""
-
-
-def axis(low: float, high: float, *, ticks: int = 4) -> charts.Axis:
+def axis(low: float, high: float) -> charts.Axis:
     """A linear axis with a little room on either side."""
     room = 0.04 * (high - low) or 1.0
-    return charts.linear(low - room, high + room, ticks=ticks)
+    return charts.linear(low - room, high + room)
 
 
-def plot(
-    curves: Sequence[PaperCurve],
-    *,
-    title: str,
-    alt: str,
-    up: charts.Axis | None = None,
-    levels: Sequence[tuple[float, str]] = (),
-    texts: Sequence[tuple[str, float, float]] = (),
-    height: int = HEIGHT,
-    left: int = 52,
-) -> Markup:
-    """Curves on one frame, `title` naming both axes; `levels` are horizontal lines with a name, `texts`
-    (text, x, y) stand centred at a place."""
-    ends = [float(bound(curve.x)) for curve in curves for bound in (np.min, np.max)]
-    values = np.concatenate([np.asarray(curve.y, float) for curve in curves])
-    up = up or axis(float(np.nanmin(values)), float(np.nanmax(values)))
-    room = 12 + max((7 * len(curve.name) for curve in curves), default=0)
+KNOWN = {"axis": axis, "linear": charts.linear, "logarithmic": charts.logarithmic, **derived.KNOWN}
+
+
+def pictures(paper: str, results: Mapping[str, Any], tables: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The figures of a paper: place there, title, caption, panels as SVG, and a table (heads, rows). `tables`
+    are those of the run, {name: columns or None}; a figure that needs one is left out without it."""
+    described = tomllib.loads(FILE.read_text(encoding="utf-8"))
+    context = {**KNOWN, **results, "tables": tables}
+    figures = [one for one in described[paper] if "needs" not in one or tables[one["needs"]]]
+    return [_figure(one, described["panel"], context) for one in figures]
+
+
+def _figure(figure: Mapping[str, Any], panels: Mapping[str, Any], context: dict[str, Any]) -> dict[str, Any]:
+    context = context | {name: _value(text, context) for name, text in figure.get("where", {}).items()}
+    named = [panels[one] if isinstance(one, str) else one for one in figure.get("panels", ())]
+    return {
+        "at": figure["at"],
+        "title": _words(figure["title"], context),
+        "caption": _words(figure.get("caption", ""), context),
+        "panels": [plot(one, context) for one in named],
+        "table": _value(figure["table"], context) if "table" in figure else None,
+    }
+
+
+def _value(expression: str, context: Mapping[str, Any]) -> Any:
+    return page.environment().compile_expression(expression, undefined_to_none=False)(**context)
+
+
+def _words(text: str, context: Mapping[str, Any]) -> str:
+    return page.environment().from_string(text).render(context)
+
+
+def _rows(values: Any) -> list[np.ndarray]:
+    """Numbers as one row, rows as they are."""
+    values = list(values)
+    nested = isinstance(values[0], list | np.ndarray)
+    return [np.asarray(row, float) for row in (values if nested else [values])]
+
+
+def plot(panel: Mapping[str, Any], context: Mapping[str, Any]) -> Markup:
+    """One frame. `lines` are [x, y, class, name]. y may hold several rows; `per` divides it. `title` names
+    both axes. The rest is optional: axes `across` and `up`; `levels` with names; centred `texts` (text, x,
+    y); `spans` (begin, end, x of the text, text); `way`, a ring and a dot at the ends of the last line."""
+    curves = []
+    for *data, css, name in panel["lines"]:
+        xs, ys = (_rows(_value(text, context)) for text in data)
+        pairs = zip(itertools.cycle(xs), ys, strict=False)
+        curves += [(x, y / panel.get("per", 1), css, name) for x, y in pairs]
+    ends = [float(bound(x)) for x, *_ in curves for bound in (np.min, np.max)]
+    values = np.concatenate([y for _, y, *_ in curves])
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    across, up = (_value(panel[key], context) if key in panel else None for key in ("across", "up"))
     frame = charts.Frame(
-        charts.linear(min(ends), max(ends)), up, WIDTH, height, left=left, below=22, above=24, right=room
+        across or charts.linear(min(ends), max(ends)),
+        up or axis(low, high),
+        WIDTH,
+        panel.get("height", HEIGHT),
+        left=panel.get("left", 52),
+        below=22,
+        above=24,
+        right=panel.get("right", 12 + max(7 * len(name) for *_, name in curves)),
     )
-    layers = [charts.level(frame, value, "lim", name) for value, name in levels]
-    layers += [charts.line(frame, curve.x, curve.y, curve.css) for curve in curves]
-    layers += [
-        charts.label(frame, curve.x[-1], curve.y[-1], curve.name, dx=5, dy=4)
-        for curve in curves
-        if curve.name
-    ]
-    layers += [charts.label(frame, x, y, text, anchor="middle") for text, x, y in texts]
-    return charts.panel(frame, layers, alt=alt, title=title)
-
-
-def plane(
-    paths: Sequence[PaperCurve],
-    *,
-    title: str,
-    alt: str,
-    across: charts.Axis,
-    up: charts.Axis,
-    way: PaperCurve | None = None,
-) -> Markup:
-    """Lines over a plane, and a way over it from a ring to a dot."""
-    frame = charts.Frame(across, up, WIDTH, 240, left=52, below=22, above=24, right=14)
-    layers = [charts.line(frame, path.x, path.y, path.css) for path in paths]
-    if way:
-        layers.append(charts.line(frame, way.x, way.y, way.css))
-        layers.append(charts.dots(frame, way.x[0], way.y[0], "begin", 4))
-        layers.append(charts.dots(frame, way.x[-1], way.y[-1], "dot whole", 4))
-    return charts.panel(frame, layers, alt=alt, title=title)
+    layers = [charts.level(frame, value, "lim", name) for value, name in panel.get("levels", ())]
+    for x, y, css, _ in curves:
+        layers.append(charts.stems(frame, x, y) if css == "stem" else charts.line(frame, x, y, css))
+    layers += [charts.label(frame, x[-1], y[-1], name, dx=5, dy=4) for x, y, _, name in curves if name]
+    for text, x, y in _value(panel.get("texts", "[]"), context):
+        layers.append(charts.label(frame, x, y, text, anchor="middle"))
+    for begin, end, x, text in _value(panel.get("spans", "[]"), context):
+        middle = end > begin
+        layers.append(charts.interval(frame, begin, end))
+        layers.append(
+            charts.label(
+                frame, x, low, text, anchor="middle" if middle else "start", dx=0 if middle else 4, dy=-2
+            )
+        )
+    if panel.get("way"):
+        x, y, *_ = curves[-1]
+        layers += [
+            charts.dots(frame, x[0], y[0], "begin", 4),
+            charts.dots(frame, x[-1], y[-1], "dot whole", 4),
+        ]
+    return charts.panel(frame, layers, alt=_words(panel["alt"], context), title=panel["title"])

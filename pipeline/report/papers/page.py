@@ -7,30 +7,30 @@ made and whether its method has changed since. No verdict, choice or export read
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from pipeline.papers import made
-from pipeline.report.papers import deposition, setpoint, study, temperature
+from pipeline.report.papers.figures import pictures
 from pipeline.report.papers.rows import FAILS, HOLDS, OPEN, SHAPE, VERDICTS, Paper, read
-from pipeline.report.papers.study import sentences
+from pipeline.report.papers.study import ranking
 from pipeline.report.shared import page
+from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
 from pipeline.store import artifacts
+from pipeline.verdict.evidence import Absent, known
 from pipeline.verdict.verdict import Missing
 
 # glyph of a verdict, by the states that the pages know
 GLYPHS = {HOLDS: "passed", SHAPE: "passed", FAILS: "failed", OPEN: "open"}
 # what else the second pipeline makes for a paper's results; told if it is older than its method
 PARTS = {"setpoint": ("search_agent", "train_agent", "camera")}
-PICTURES = {
-    "temperature": temperature.pictures,
-    "deposition": deposition.pictures,
-    "setpoint": setpoint.pictures,
-}
 
 
 def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mapping[str, str]) -> str:
     """The page of the papers in `files`, {key: (printed, results)}; `others` are the files of the stages
     reproduce_study and relearned."""
+    course, classified = (known(sources.tables[name], None) for name in ("course", "classified"))
+    tables = {"course": course if course and len(course["epoch"]) else None, "classified": classified}
     shown, gaps = [], []
     for key, (printed, results) in files.items():
         paper = read(printed, results, sources.metrics)
@@ -43,7 +43,7 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
                 "paper": paper,
                 "brief": brief(paper),
                 "rows": paper.rows,
-                "pictures": PICTURES[key](paper.results, sources),
+                "pictures": pictures(key, paper.results, tables),
                 "files": (printed, results),
                 "made": " ".join(
                     made.sentence(one) for one in (key, *filter(made.changed, PARTS.get(key, ())))
@@ -71,15 +71,17 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
         gaps=gaps,
         state=GLYPHS,
         fails=FAILS,
-        study=study.part(_results(others["reproduce_study"], "reproduce_study")),
-        relearned=sentences(_results(others["relearned"], "relearned")),
+        study=_results(others["reproduce_study"], "reproduce_study"),
+        ranking=ranking,
+        relearned=_results(others["relearned"], "relearned"),
         made={name: made.sentence(name) for name in others},
     )
 
 
-def _results(path: str, stage: str) -> Mapping | Missing:
+@as_table()
+def _results(path: str, stage: str) -> dict[str, Any]:
     if not artifacts.exists(path):
-        return Missing("not measured", f"{path} is not there", f"Run {made.command(stage)}")
+        raise Absent(Missing("not measured", f"{path} is not there", f"Run {made.command(stage)}"))
     return artifacts.read_json(path)
 
 

@@ -5,12 +5,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
 from pipeline.report.setpoint import deciding as deciding_case
-from pipeline.report.shared import charts, page
+from pipeline.report.shared import page
 from pipeline.report.shared.card import (
-    PICTURE,
     Card,
     Deciding,
     best_of,
@@ -25,11 +23,10 @@ from pipeline.report.shared.difference import Change
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import FLOW_BAND
 from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
-from pipeline.verdict.digits import MINUS, THIN, band, count, number
+from pipeline.verdict.digits import MINUS, THIN, band, number
 from pipeline.verdict.evidence import (
     Absent,
     entry,
-    gap_of,
     instead,
     known,
     lookup,
@@ -46,7 +43,6 @@ from pipeline.verdict.setpoint import (
     Harm,
     bars,
     board,
-    case_text,
     harm_of,
     lasting,
     role,
@@ -57,8 +53,6 @@ from pipeline.verdict.setpoint import (
 from pipeline.verdict.verdict import FAILED, PASSED, Figure, Missing, Question, Verdict, state
 
 MOVES = "Nozzle camera to setpoints"
-# cases that the picture has room for, the worst first
-MOST_CASES = 8
 
 
 def card(sources: Sources, verdict: Verdict) -> Card:
@@ -158,41 +152,24 @@ def _step(verdict: Verdict) -> dict[str, str]:
 
 @or_gap
 def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
-    """The case that decides, decision by decision; where its runs were not kept, runs that settle, or settle
-    and stay, in every case that counts, the worst first. Of the three of the card."""
+    """The case that decides, decision by decision, of the three of the card."""
     scores = need(board(sources.evidence, sources.subject("setpoint")))
     if not scores.default:
         return Missing("not measured", "No controller was chosen")
-    stays, asked = verdict.rule.startswith("Stays"), sources.declared.rules
-    limit = asked.stay_percent if stays else asked.settled_percent
+    stays, names = verdict.rule.startswith("Stays"), shown(scores)
     what, does = ("stay", "settle and stay") if stays else ("settled", "settle")
-    names = shown(scores)
     cases = [case for case, cell in scores.counting(scores.default) if isinstance(_of(cell, what), Figure)]
-    cases.sort(key=lambda case: _value(scores, names[0], case, what))
     if not cases:
         return Missing("not measured", "no case counts")
-    first, more = cases[0], len(cases) - MOST_CASES
+    first = min(cases, key=lambda case: _value(scores, names[0], case, what))
     listed = ", ".join(f"{name} {_text(scores, name, first, what)}" for name in names)
-    entrants = [entrant(role(scores, name), name) for name in names]
     low, high = deciding_case.MIDDLE
-    traced = deciding_case.panel(sources, scores, first, names)
-    if not gap_of(traced):
-        return Deciding(
-            f"Runs that {does} in {within(first)}: {listed}.",
-            traced,
-            f"Median and {high - low}{THIN}% of the runs; dashed: ±{FLOW_BAND:g}{THIN}%.",
-            page.linked(sources.source("paths"), short=True),
-            entrants,
-        )
-    finding = f"Runs that {does}, by case; the case that decides first, {within(first)}: {listed}."
-    drawn = _drawn(scores, names, cases[:MOST_CASES], what, limit, finding, (*PICTURE, 150))
-    beyond = f" {count(more, 'better case').capitalize()} on the loop’s page." if more > 0 else ""
     return Deciding(
-        finding,
-        drawn,
-        f"Line: the limit, {limit:g}{THIN}%. Bars: 95{THIN}% intervals.{beyond}",
-        page.linked(sources.source("scoreboard")),
-        entrants,
+        f"Runs that {does} in {within(first)}: {listed}.",
+        need(deciding_case.panel(sources, scores, first, names)),
+        f"Median and {high - low}{THIN}% of the runs; dashed: ±{FLOW_BAND:g}{THIN}%.",
+        page.linked(sources.source("paths"), short=True),
+        [entrant(role(scores, name), name) for name in names],
     )
 
 
@@ -209,43 +186,6 @@ def _value(scores: Board, name: str, case: Case, what: str) -> float:
 def _text(scores: Board, name: str, case: Case, what: str) -> str:
     cell = scores.cells.get((name, case))
     return "not run" if cell is None else share_text(_of(cell, what))
-
-
-def _drawn(
-    scores: Board, names: Sequence[str], cases: Sequence[Case], what: str, limit: float, alt: str,
-    size: tuple[int, int, int],
-) -> Markup:  # fmt: skip
-    """A row a case, a mark with its interval a controller."""
-    width, height, left = size
-    x = charts.Axis(0, 100, tuple((float(v), str(v)) for v in (0, 25, 50, 75, 100)))
-    frame = charts.Frame(x, charts.Axis(-0.5, len(cases) - 0.5, ()), width, height, left, 34, 8, 14)
-    a = float(frame.px(limit))
-    layers = [Markup('<line class="lim" x1="{:.1f}" x2="{:.1f}" y1="8" y2="{}"/>').format(a, a, height - 34)]
-    for i, case in enumerate(cases):
-        lane = len(cases) - 1 - i
-        layers.append(charts.label(frame, 0.0, lane, _short(case, left), anchor="end", dx=-8, dy=4))
-        for k, name in enumerate(names):
-            cell = scores.cells.get((name, case))
-            figure = None if cell is None else _of(cell, what)
-            if isinstance(figure, Figure):
-                layers.append(_lane(frame, lane + 0.24 * (1 - k), figure, page.MARKS[role(scores, name)]))
-    return charts.panel(frame, layers, alt=alt, css="mb lead-picture", across="runs, %", units=("%", ""))
-
-
-def _short(case: Case, left: int) -> str:
-    """A case's name as long as there is room for it left of the axis, 7 px a letter."""
-    text = case_text(case, whole=True).replace("Recorded windows", "Windows").replace("simulator", "sim.")
-    most = left // 7
-    return text if len(text) <= most else text[: most - 1] + "…"
-
-
-def _lane(frame: charts.Frame, at: float, figure: Figure, css: str) -> Markup:
-    low, middle, high = (float(value) for value in frame.px([figure.low, figure.value, figure.high]))
-    y = float(frame.py(at))
-    bar = Markup('<line class="{}" x1="{:.1f}" x2="{:.1f}" y1="{:.1f}" y2="{:.1f}"/>').format(
-        css, low, high, y, y
-    )
-    return Markup("{}{}").format(bar, charts.mark(css, f"{middle:.1f}", y))
 
 
 # points closer than this are one: the accepted figures are kept rounded

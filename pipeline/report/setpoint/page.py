@@ -4,16 +4,16 @@ case, and what the camera's classifier is worth."""
 from typing import Any
 
 from pipeline.report.deposition.page import flat
-from pipeline.report.setpoint import agent as setpoint_agent
 from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.setpoint import deciding as setpoint_deciding
+from pipeline.report.setpoint import harm as setpoint_harm
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import BEYOND
-from pipeline.verdict.digits import THIN, band, number, percent, quantity
-from pipeline.verdict.evidence import gap_of, known, lookup, need, need_figure, or_nothing
+from pipeline.verdict.digits import band
+from pipeline.verdict.evidence import gap_of, known
 from pipeline.verdict.setpoint import (
     DATA_DRIVEN,
     MODEL_BASED,
@@ -69,8 +69,7 @@ LANES = {"data_driven": "dd", "model_based": "mb", "baseline": "acc"}
 def render(sources: Sources) -> str:
     """The text of setpoint.html."""
     judged, scores = sources.verdicts["setpoint"], board(sources.evidence, sources.subject("setpoint"))
-    judged_scores = known(scores, None)
-    claimed = setpoint_agent.claims(sources)
+    judged_scores, classified = known(scores, None), known(sources.tables["classified"], None)
     return page.render(
         "setpoint.html",
         here="setpoint",
@@ -97,52 +96,29 @@ def render(sources: Sources) -> str:
         # cases that the first screen has no room for: those in which the default fares best
         better=max(len(_counting(judged_scores)) - MOST, 0) if judged_scores else 0,
         deciding=setpoint_deciding.picture(sources, scores),
-        boards=boards(sources, judged_scores) if judged_scores else [],
+        boards=boards(judged_scores) if judged_scores else [],
         worsts=worsts(judged_scores) if judged_scores else [],
-        harms=setpoint_agent.harms(sources, scores),
-        why_default=choice_sentence(sources),
-        ways=setpoint_agent.ways(sources, scores),
+        harms=setpoint_harm.harms(sources, scores),
+        choice=known(sources.tables["choice"], {}),
         strips=setpoint_why.strips(sources),
-        training=setpoint_agent.training(sources),
-        phases=setpoint_agent.phases(sources),
-        claims=known(claimed, []),
-        claims_missing=gap_of(claimed),
-        guesses=setpoint_agent.guesses(sources),
-        agent_made=setpoint_agent.kept_sentence(),
-        good_named=good_named(sources),
+        good=classified["named"][classified["label"] == GOOD] == GOOD if classified else [],
         by_flow=setpoint_vision.by_flow(sources),
         yardsticks=setpoint_vision.yardsticks(sources),
         reliability=setpoint_vision.reliability(sources),
-        confusion=setpoint_vision.confusion(sources),
-        distributions=setpoint_vision.distributions(sources),
-        course=setpoint_vision.learning_curves(sources),
         frames=setpoint_vision.frames(sources),
+        classes=setpoint_vision.CLASSES,
+        places=("rejected", *setpoint_vision.CLASSES, *setpoint_vision.GROUPS),
+        scores=judged_scores,
+        rules=sources.declared.rules,
+        beyond=BEYOND,
+        simulators=SIMULATORS,
+        **{function.__name__: function for function in (share_text, case_text, lasting, role, worst)},
         data=setpoint_vision.data(sources),
         declared=[(section, flat(sources.declared.everything.get(section, {}))) for section in SECTIONS],
         words=words.chosen(sources, WORDS),
         from_board=sources.source("scoreboard", "choice"),
-        from_agents=sources.source("train_agent"),
         from_classifier=sources.source("train_classifier", "classified"),
     )
-
-
-@or_nothing
-def good_named(sources: Sources) -> str:
-    """How many frames of good prints the classifier names good."""
-    table = need(sources.tables["classified"])
-    right = table["named"][table["label"] == GOOD] == GOOD
-    if not len(right):
-        return ""
-    return f"Of {len(right):,} frames of good prints {percent(100 * float(right.mean()), 2)} are named good."
-
-
-@or_nothing
-def choice_sentence(sources: Sources) -> str:
-    """Why the default is the default, as the stage that chose it says, and who may not run."""
-    said = need_figure(sources.tables["choice"], "sentence")
-    refused = known(lookup(sources.tables["choice"], "refused"), {})
-    barred = [f"{name} {why}." for name, why in refused.items()]
-    return " ".join([str(said), *(["May not run:"] if barred else []), *barred]).replace("+-", "±")
 
 
 def heads(scores: Board | None) -> list[dict[str, Any]]:
@@ -238,109 +214,33 @@ def _reading(name: str, cell: Cell | None, lost: Question, css: str) -> dict[str
 # ---- the scoreboard
 
 
-def boards(sources: Sources, scores: Board) -> list[dict[str, Any]]:
-    """A table for each simulator: controllers down, cases across; vermillion where the whole interval lies
-    beyond a limit, bold in a controller's own worst case."""
-    asked = sources.declared.rules
-    limits = {
-        "settled": asked.settled_percent,
-        "stay": asked.stay_percent,
-        "recovered": asked.settled_percent,
-    }
+def boards(scores: Board) -> list[dict[str, Any]]:
+    """A table for each simulator: controllers down, cases across."""
     tables = []
     for simulator in dict.fromkeys(case[0] for case in scores.cases):
         cases = [case for case in scores.cases if case[0] == simulator]
         cells = [cell for (_, case), cell in scores.cells.items() if case[0] == simulator]
-        runs = sorted({cell.runs for cell in cells})
-        names = [name for name in scores.names if any((name, case) in scores.cells for case in cases)]
         tables.append(
             {
-                "id": f"board-{simulator}",
-                "name": SIMULATORS.get(simulator, simulator),
-                "heads": [case_text(case) for case in cases],
-                "rows": [_row(scores, name, cases, limits) for name in names],
+                "simulator": simulator,
+                "cases": cases,
+                "names": [
+                    name for name in scores.names if any((name, case) in scores.cells for case in cases)
+                ],
                 "counts": any(cell.counts for cell in cells),
-                "runs": f"{runs[0]:,}" if len(runs) == 1 else f"{runs[0]:,} to {runs[-1]:,}",
+                "runs": sorted({cell.runs for cell in cells}),
             }
         )
     return tables
 
 
-def _row(scores: Board, name: str, cases: list[Case], limits: dict[str, float]) -> dict[str, Any]:
-    """One controller's row in the cases of one simulator."""
-    _, lowest = worst(scores, name, "lasting")
-    return {
-        "name": name,
-        "mark": role(scores, name),
-        "default": name == scores.default,
-        "kind": scores.kinds[name],
-        "cells": [_cell(scores.cells.get((name, case)), limits, bold=case == lowest) for case in cases],
-    }
-
-
-def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> dict[str, Any]:
-    """One controller in one case, in words; bold in its own worst case."""
-    if cell is None:
-        return {"lines": [], "steps": "", "more": "", "tip": "", "bold": False}
-    lines = []
-    for what, word in (("settled", ""), ("stay", "stay "), ("recovered", "recover ")):
-        share = getattr(cell, what)
-        if isinstance(share, Figure):
-            failed = state(Question(0, "", "", "%", limits[what], True, ""), share) == FAILED
-            text = f"{word}{quantity(share.value, '%', 1)}"
-            lines.append({"text": text, "band": _worth(cell, what, share), "bad": failed})
-    for points, share in zip(BEYOND, cell.beyond, strict=False):
-        if isinstance(share, Figure):
-            text = f"beyond {points}: {quantity(share.value, '%', 1)}"
-            lines.append({"text": text, "band": band(share.low, share.high, 1), "bad": False})
-    steps = (
-        "none settles"
-        if cell.median != cell.median
-        else f"{number(cell.median, 0)} steps, p90 {number(cell.p90, 0)}"
-    )
-    more = f"past it {number(cell.overshoot, 0)}{THIN}%" if cell.overshoot == cell.overshoot else ""
-    more += f", off {number(cell.flow_error, 1)}{THIN}%" if cell.flow_error == cell.flow_error else ""
-    flow, degrees, share = cell.worst_start
-    return {
-        "lines": lines,
-        "steps": steps,
-        "more": more.strip(", "),
-        "tip": f"{cell.runs:,} runs; fewest settle from {flow:g} % and {degrees:g} °C: {number(share, 0)} %",
-        "bold": bold,
-    }
-
-
-def _worth(cell: Cell, what: str, share: Figure) -> str:
-    """The interval of a share, and as many runs that share nothing as it is worth."""
-    n_eff = cell.n_eff.get(what, float("nan"))
-    worth = "" if n_eff != n_eff else f", n_eff {number(n_eff, 0)}"
-    return f"{band(share.low, share.high, 1)}{worth}"
-
-
-def worsts(scores: Board) -> list[dict[str, Any]]:
-    """Everybody's worst case, the best first, with the start from which fewest settle there."""
+def worsts(scores: Board) -> list[tuple[str, Case, Cell, float]]:
+    """Everybody's worst case and its cell, the best first, with the mean share over the cases that count."""
     rows = []
     for name in scores.names:
-        figure, case = worst(scores, name, "lasting")
-        if case is None:
-            continue
-        cell = scores.cells[name, case]
-        shares = [
-            share.value for _, other in scores.counting(name) if isinstance(share := lasting(other), Figure)
-        ]
-        flow, degrees, settled = cell.worst_start
-        rows.append(
-            {
-                "name": name,
-                "mark": role(scores, name),
-                "default": name == scores.default,
-                "kind": scores.kinds[name],
-                "case": case_text(case, whole=True),
-                "value": share_text(figure),
-                "band": band(figure.low, figure.high, 1),
-                "n_eff": number(cell.n_eff["stay"], 0) if cell.n_eff.get("stay", 0) > 0 else "",
-                "mean": percent(sum(shares) / len(shares), 3),
-                "start": f"{flow:g}{THIN}%, {degrees:g}{THIN}°C: {number(settled, 0)}{THIN}% settle",
-            }
-        )
+        _, case = worst(scores, name, "lasting")
+        shares = [lasting(cell) for _, cell in scores.counting(name)]
+        values = [share.value for share in shares if isinstance(share, Figure)]
+        if case is not None:
+            rows.append((name, case, scores.cells[name, case], sum(values) / len(values)))
     return rows

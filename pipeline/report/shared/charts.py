@@ -236,14 +236,6 @@ def readable(frame: Frame, units: tuple[str, str] = ("", "")) -> Markup:
 
 # ---- layers
 
-CIRCLE = np.stack([of(np.linspace(0, 2 * np.pi, 181)) for of in (np.cos, np.sin)])  # the unit circle
-
-
-def inside(frame: Frame, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Those of the points that lie on the panel."""
-    seen = (x >= frame.x.low) & (x <= frame.x.high) & (y >= frame.y.low) & (y <= frame.y.high)
-    return x[seen], y[seen]
-
 
 def decimated(x: np.ndarray, y: np.ndarray, most: int = 240) -> tuple[np.ndarray, np.ndarray]:
     """At most 3 `most` points: of each of `most` stretches its lowest and its
@@ -335,16 +327,6 @@ def stems(frame: Frame, x, y, css: str = "stem") -> Markup:
         f"M{_n(a)} {zero}V{_n(b)}" for a, b in zip(frame.px(x), frame.py(y), strict=True) if not math.isnan(b)
     )
     return Markup('<path class="{}" d="{}"/>').format(css, strokes) if strokes else Markup("")
-
-
-def crosses(frame: Frame, x, y, css: str = "cross", size: float = 3.5) -> Markup:
-    """Poles, as the field draws them."""
-    back = _n(2 * size)
-    strokes = "".join(
-        f"M{_n(a - size)} {_n(b - size)}l{back} {back}m-{back} 0l{back} -{back}"
-        for a, b in zip(frame.px(x), frame.py(y), strict=True)
-    )
-    return Markup('<path class="{}" d="{}"/>').format(css, strokes)
 
 
 def dots(frame: Frame, x, y, css: str = "dot", radius: float = 2.2) -> Markup:

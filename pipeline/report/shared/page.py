@@ -18,6 +18,9 @@ from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
 from pipeline.temperature.controllers.table import CONTROLLERS as CONTESTANTS
 from pipeline.verdict import digits
+from pipeline.verdict.controllers import heading, in_a_sentence
+from pipeline.verdict.deposition import NOT_JUDGED
+from pipeline.verdict.evidence import entry, gap_of
 from pipeline.verdict.settings import QUICK_LOOK
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 
@@ -71,6 +74,9 @@ def environment() -> jinja2.Environment:
         "missing": missing,
         "term": term,
         "word_id": word_id,
+        "entry": entry,
+        "gap_of": gap_of,
+        "not_judged": NOT_JUDGED,
     }
     script = Markup(templates.get_template("page.js").render().strip())
     templates.globals |= {
@@ -82,6 +88,14 @@ def environment() -> jinja2.Environment:
         "shortened": digits.shortened,
         "typeset": digits.typeset,
         "count": digits.count,
+        "number": digits.number,
+        "percent": digits.percent,
+        "quantity": digits.quantity,
+        "band": digits.band,
+        "listed": digits.listed,
+        "short": digits.short,
+        "heading": heading,
+        "in_a_sentence": in_a_sentence,
     }
     return templates
 

@@ -21,7 +21,6 @@ from pipeline.setpoint.tables import (
     PATHS,
     RELIABILITY,
     SCOREBOARD,
-    WINDOWS,
 )
 from pipeline.store import artifacts
 from pipeline.temperature import tables as schemas
@@ -307,7 +306,6 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("classified", "train_classifier", "classified.parquet", *table(CLASSIFIED)),
         ("reliability", "train_classifier", "reliability.parquet", *table(RELIABILITY)),
         ("course", "train_classifier", "course.parquet", *table(CLASSIFIER_CURVE)),
-        ("windows", "train_classifier", "windows.parquet", *table(WINDOWS)),
         ("nozzle_frames", "train_classifier", "frames/frames.json", "frames 1", _frames),
         ("agents", "train_agent", "agents.parquet", *table(AGENT_CURVE)),
         ("scoreboard", "evaluate_setpoint", "scoreboard.parquet", *table(SCOREBOARD)),

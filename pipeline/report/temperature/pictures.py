@@ -1,5 +1,5 @@
-"""Three large pictures of the temperature page: a typical case and the deciding one under the contestants
-that matter, and how the pair compares plant by plant."""
+"""Pictures of the temperature page: how the pair compares plant by plant, what less of the record costs, and
+the record."""
 
 import math
 from typing import Any
@@ -14,19 +14,15 @@ from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, 
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.judgement import Judgement, named_before
 from pipeline.temperature.tables import set_point_of
-from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading, in_a_sentence, kind
+from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading, in_a_sentence
 from pipeline.verdict.digits import THIN, count, number, short
-from pipeline.verdict.evidence import Absent, Table, entry, known, lookup, need, need_figure, or_nothing
-from pipeline.verdict.pairs import curve_sentence, pair_names, reference_of
-from pipeline.verdict.temperature import comparison, names, refused
-from pipeline.verdict.verdict import UNJUDGED, Missing
+from pipeline.verdict.evidence import Absent, Table, entry, known, need, need_figure, or_nothing
+from pipeline.verdict.pairs import curve_sentence, pair_names
+from pipeline.verdict.temperature import comparison, names
+from pipeline.verdict.verdict import Missing
 
 # the baseline that stands beside the pair if nobody runs yet
 PI, IDLE = ("pi_simc", "pi"), "hold"
-
-CASES = {"typical": "A typical case", "deciding": "The case that decides"}
-# a cost or temperature beyond it is of a loop that is lost; it is drawn at the edge
-LARGEST = 1e4
 
 
 def contestants(sources: Sources, judged: Judgement) -> dict[str, str]:
@@ -38,160 +34,6 @@ def contestants(sources: Sources, judged: Judgement) -> dict[str, str]:
     there = [name for name in dict.fromkeys(wanted) if name == judged.subject or judged.answers.get(name)]
     kinds = {name: BY_NAME[name].kind if name in BY_NAME else "" for name in there[:3]}
     return in_order(kinds, champion)
-
-
-def list_drawn(sources: Sources, judgement: Judgement) -> list[str]:
-    """Who has a column of a case: the pair, the best, and PI, in the order of simplicity."""
-    wanted = {*pair_names(sources.metrics), judgement.subject, "pi"}
-    return [name for name in (*names(sources.metrics), *refused(sources.metrics)) if name in wanted]
-
-
-def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
-    """Temperatures with their references and commands of one case, a column a contestant."""
-    return as_picture(name, CASES[name])(_case)(sources, judgement, name)
-
-
-def _case(sources: Sources, judgement: Judgement, name: str) -> Picture:
-    table = need(sources.tables["trajectories"])
-    without = refused(sources.metrics)
-    rows = {
-        who: (table["contestant"] == who) & (table["case_name"] == name)
-        for who in list_drawn(sources, judgement)
-    }
-    runs = {
-        who: {key: values[mask] for key, values in table.items()}
-        for who, mask in rows.items()
-        if mask.any() and who not in without
-    }
-    if not runs:
-        raise Absent(Missing("not measured", f"no trajectory of the {name} case was recorded"))
-    settled = entry(comparison(sources.metrics), "settled_steps")
-    ends = {
-        who: _past(run, [o.name for o in sources.declared.machine.outputs], settled)
-        for who, run in runs.items()
-    }
-    _, zone = ends.get(judgement.subject, next(iter(ends.values())))
-    whole, runs = runs, _early(runs, next(q.limit for q in judgement.asked if q.key == "settling"))
-    y = _temperatures(sources, list(runs.values()))
-    most = max(
-        float(np.nanmax(run[f"{i.name}_applied"]))
-        for run in runs.values()
-        for i in sources.declared.machine.inputs
-    )
-    shown = []
-    for who in rows:
-        panels = (
-            [
-                _heat(sources, who, runs[who], y, ends[who], first=not shown),
-                _commands(sources, who, runs[who], most, first=not shown),
-            ]
-            if who in runs
-            else [page.hole(Missing("failed", without.get(who, "no trajectory was recorded")))]
-        )
-        shown.append(PictureColumn(heading(who), kind(who), who, panels))
-    return Picture(
-        _finding(sources, name, ends),
-        shown,
-        f"{_extent(whole, runs)}Above: true temperature of every zone in °C, dashed its reference. Below: "
-        "every command in per cent as the machine was given it; grey: within its limits. Against time in s.",
-        page.origin(sources.source("trajectories"), case_name=name, contestant=list(runs), y=zone),
-    )
-
-
-def _early(runs: dict[str, Table], settling_s: float) -> dict[str, Table]:
-    """Of constant references the first part, half as long again as settling may last; of others all of it."""
-    first = next(iter(runs.values()))
-    constant = all(np.ptp(values) == 0 for key, values in first.items() if key.endswith("_reference"))
-    span = 1.5 * settling_s if constant and math.isfinite(settling_s) else math.inf
-    return {
-        who: {key: values[run["time_s"] <= span] for key, values in run.items()} for who, run in runs.items()
-    }
-
-
-def _extent(whole: dict[str, Table], runs: dict[str, Table]) -> str:
-    """What part of the runs is drawn; "" where all of it is."""
-    drawn_s, all_s = (next(iter(part.values()))["time_s"][-1] for part in (runs, whole))
-    return f"The first {short(drawn_s, 2)} of {short(all_s, 2)} s. " if drawn_s < all_s else ""
-
-
-def _temperatures(sources: Sources, runs: list[Table]) -> charts.Axis:
-    names = [o.name for o in sources.declared.machine.outputs]
-    values = np.concatenate([run[key] for run in runs for n in names for key in (n, f"{n}_reference")])
-    values = values[np.isfinite(values) & (np.abs(values) < LARGEST)]
-    if not len(values):
-        return charts.linear(0, 1)
-    room = 0.04 * (float(values.max() - values.min()) or 1.0)
-    return charts.linear(float(values.min()) - room, float(values.max()) + room)
-
-
-def _heat(
-    sources: Sources, who: str, run: Table, y: charts.Axis, end: tuple[float, str], *, first: bool
-) -> Markup:
-    time, outputs = run["time_s"], sources.declared.machine.outputs
-    frame = charts.Frame(charts.linear(0, float(time[-1]) or 1.0, ticks=3), y, width=360, height=210, left=32)
-    past, zone = end
-    layers = [charts.line(frame, time, run[f"{o.name}_reference"], "ref") for o in outputs]
-    layers += [charts.line(frame, time, np.clip(run[o.name], -LARGEST, LARGEST), "line") for o in outputs]
-    return charts.panel(
-        frame,
-        layers,
-        alt=f"{heading(who)}: {zone} ends {_degrees(past)} from its reference, worst of {len(outputs)} zones",
-        css=page.MARKS.get(who, "bl"),
-        title="°C" if first else "",
-        units=("s", "°C"),
-    )
-
-
-def _past(run: Table, names: list[str], settled: object) -> tuple[float, str]:
-    """The settled error of a run, over as many steps as the rule's (a tenth where that is not known): how far
-    the furthest zone's mean lies from its reference, and whose it is."""
-    steps = settled if isinstance(settled, int) else len(run["time_s"]) // 10
-    last = slice(-max(steps, 1), None)
-    apart = {name: float(np.abs(np.mean((run[name] - run[f"{name}_reference"])[last]))) for name in names}
-    zone = max(apart, key=lambda name: apart[name] if math.isfinite(apart[name]) else math.inf)
-    return apart[zone], zone
-
-
-def _degrees(value: float) -> str:
-    return f"{short(value, 2)} °C" if value < LARGEST else "too far to say 1 figure"
-
-
-def _commands(sources: Sources, who: str, run: Table, most: float, *, first: bool) -> Markup:
-    machine, time = sources.declared.machine, run["time_s"]
-    low, high = min(i.low for i in machine.inputs), max(i.high for i in machine.inputs)
-    reach = min(high, most)
-    room = 0.08 * ((reach - low) or 1.0)
-    y = charts.linear(low, reach + room, ticks=3)._replace(low=low - room)
-    frame = charts.Frame(charts.linear(0, float(time[-1]) or 1.0, ticks=3), y, width=360, height=130, left=32)
-    layers = [charts.tint(frame, low, min(high, y.high))]
-    layers += [
-        charts.line(frame, time, run[f"{i.name}_applied"], "line thin", steps=True) for i in machine.inputs
-    ]
-    given = np.stack([run[f"{i.name}_applied"] for i in machine.inputs])
-    at = np.stack(
-        [(run[f"{i.name}_applied"] <= i.low) | (run[f"{i.name}_applied"] >= i.high) for i in machine.inputs]
-    )
-    return charts.panel(
-        frame,
-        layers,
-        alt=f"{heading(who)}: commands from {number(float(np.nanmin(given)), 0)} to "
-        f"{number(float(np.nanmax(given)), 0)} %, "
-        f"at a limit {number(100 * float(at.mean()), 1)} % of the time",
-        css=page.MARKS.get(who, "bl"),
-        title="%" if first else "",
-        units=("s", "%"),
-    )
-
-
-def _finding(sources: Sources, name: str, ends: dict[str, tuple[float, str]]) -> str:
-    parts = [f"{in_a_sentence(who)} {_degrees(value)}" for who, (value, _) in ends.items() if value < LARGEST]
-    where = ""
-    decides = entry(comparison(sources.metrics), "deciding")
-    if name == "deciding" and entry(decides, "plant") is not None:
-        where = f"Plant {decides['plant']}{', ' + reference_of(decides) if decides.get('kind') else ''}. "
-    if not parts:
-        return f"{where}No contestant ends near its reference."
-    return f"{where}Settled error of the worst zone: {', '.join(parts)}."
 
 
 # ---- plant by plant
@@ -396,69 +238,6 @@ def until_settled(table: Table, runs: dict[str, np.ndarray], zone: str) -> float
     return float(min(3 * outside.max(initial=0.0) + 1, time.max()))
 
 
-def excitation(sources: Sources) -> Picture:
-    """How strongly each input was moved, by frequency."""
-    title = "What the next experiment would excite" if sources.recorded else "What the probing excites"
-    return as_picture("excitation", title)(_excitation)(sources)
-
-
-def _excitation(sources: Sources) -> Picture:
-    stage = "generate_probing" if sources.recorded else "probe_machine"
-    metrics = (
-        lookup(sources.metrics[stage], "next_experiment") if sources.recorded else sources.metrics[stage]
-    )
-    if sources.recorded and entry(metrics, "written") is False:
-        raise Absent(Missing(UNJUDGED, f"Not written: {entry(metrics, 'reason')}"))
-    levels, machine = np.array(need_figure(metrics, "level_percent_per_band")), sources.declared.machine
-    y = charts.linear(0, 1.1 * float(levels.max()), ticks=3)
-    names = (
-        [signal.name for signal in machine.inputs]
-        if levels.shape[1] == len(machine.inputs)
-        else [f"input {i + 1}" for i in range(levels.shape[1])]
-    )
-    shown = []
-    for i, name in enumerate(names):
-        edges = np.linspace(0, 1, len(levels) + 1)
-        frame = charts.Frame(charts.Axis(0, 1, ((0, "0"), (1, "π"))), y, width=150, height=96, left=24)
-        layer = charts.line(frame, edges, np.append(levels[:, i], levels[-1, i]), steps=True)
-        shown.append(
-            PictureColumn(
-                name,
-                "",
-                "",
-                [
-                    charts.panel(
-                        frame,
-                        [layer],
-                        alt=f"{name}: level {number(float(levels[:, i].min()), 2)} to "
-                        f"{number(float(levels[:, i].max()), 2)} % "
-                        "in eight bands from 0 to π rad a step",
-                        title="%" if i == 0 else "",
-                        units=("of π", "%"),
-                    )
-                ],
-            )
-        )
-    rank, full, order = (lookup(metrics, f"excitation_{key}") for key in ("rank", "full_rank", "order"))
-    condition, limited = entry(metrics, "excitation_condition"), entry(metrics, "limited_share")
-    text = f"Exciting of order {order}: rank {rank} of {full}" + (
-        "." if condition is None else f", condition {short(condition)}."
-    )
-    if limited is not None:
-        text += (
-            f" {number(100 * limited, 0)}{THIN}% of all commands met a limit of amplitude, rate or machine"
-        )
-        text += "." if sources.recorded else "; what was applied is what is recorded."
-    if sources.recorded:
-        text = f"The experiment that is designed to be run next, not what was recorded. {text}"
-    return Picture(
-        text,
-        shown,
-        "R.m.s. level in per cent within equal bands of frequency, 0 to π rad a step.",
-        page.origin(sources.source(stage)),
-    )
-
-
 LINES = 8  # that a link into the viewer opens at most
 NO_FLAGS: Table = dict.fromkeys(("signal", "start_s", "end_s", "kind"), np.empty(0, object))
 
@@ -574,27 +353,4 @@ def flaws(sources: Sources, most: int = 40) -> dict[str, Any]:
     quality = pd.DataFrame(table)
     quality = quality.assign(used=quality["kind"] != "quarantined", start=quality["start_s"].fillna(0.0))
     quality = quality.sort_values(["used", "recording", "signal", "kind", "start"])
-    return {
-        "rows": [
-            {
-                "recording": str(row["recording"]),
-                "signal": str(row["signal"]) or "whole recording",
-                "kind": str(row["kind"]),
-                "place": (
-                    ""
-                    if np.isnan(row["start_s"])
-                    else f"{_seconds(row['start_s'])} to {_seconds(row['end_s'])}{THIN}s"
-                ),
-                "samples": number(float(row["count"]), 0),
-                "message": str(row["message"]),
-                "bad": row["kind"] == "quarantined",
-            }
-            for row in quality.head(most).to_dict("records")
-        ],
-        "more": max(len(quality) - most, 0),
-        "missing": None,
-    }
-
-
-def _seconds(value: float) -> str:
-    return number(float(value), 0 if float(value).is_integer() or abs(value) >= 1000 else 2)
+    return {"rows": quality.head(most).to_dict("records"), "more": max(len(quality) - most, 0)}

@@ -8,8 +8,8 @@ from typing import Any
 from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.judgement import Judgement, heads
-from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading, in_a_sentence
-from pipeline.verdict.digits import THIN, count, number, short
+from pipeline.verdict.controllers import BY_NAME, YARDSTICKS, heading
+from pipeline.verdict.digits import THIN, count, short
 from pipeline.verdict.evidence import Absent, entry, gap_of, need
 from pipeline.verdict.temperature import comparison, finite, names, refused, unstable
 from pipeline.verdict.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
@@ -41,7 +41,7 @@ ORDER = (
 )
 
 
-@as_table(heads=[], rows=[], caption="", below=[])
+@as_table()
 def scorecard(sources: Sources, judgement: Judgement, words: Mapping[str, str]) -> dict[str, Any]:
     """Every contestant that was judged, in the order of simplicity, and those that were refused."""
     metrics = sources.metrics
@@ -56,25 +56,12 @@ def scorecard(sources: Sources, judgement: Judgement, words: Mapping[str, str]) 
         "rows": [
             _row(sources, asked[key], judged, judgement, words.get(key, "")) for key in ORDER if key in asked
         ],
-        "caption": _caption(sources),
-        "below": [
-            *filter(None, [_gap(compared, judged), _at_bound(compared, judged), _broken(compared, judged)]),
-            *(
-                f"{heading(name)[:1].upper()}{heading(name)[1:]} is refused: {why.rstrip('.')}."
-                for name, why in refused(metrics).items()
-            ),
-        ],
+        "source": entry(compared, "limits", "source") or "declared",
+        "gaps": _gaps(compared, judged),
+        "bounds": [(name, entry(compared, "contestants", name, "at_bound")) for name in judged],
+        "broken": [(name, entry(compared, "redesigned", name)) for name in judged],
+        "refused": refused(metrics),
     }
-
-
-def _caption(sources: Sources) -> str:
-    compared = comparison(sources.metrics)
-    return (
-        f"As deployed on {setting(compared)}. Large: the 90{THIN}% quantile of all cases; small: "
-        "its band is of this one learned controller, plants resampled; the median; the worst case. "
-        "Bold: best of a row, hold and the exact model left aside. A cross, vermillion: beyond the limit. "
-        f"Limits: {entry(compared, 'limits', 'source') or 'declared'}."
-    )
 
 
 def setting(compared: Mapping[str, Any]) -> str:
@@ -193,74 +180,27 @@ def _worst_title(own: Any, key: str) -> str:
 # ---- below the table
 
 
-def _gap(compared: Mapping[str, Any], names: list[str]) -> str:
-    """The gap of every contestant with its convention in the same line; it decides nothing."""
+def _gaps(compared: Mapping[str, Any], names: list[str]) -> list[dict[str, Any]]:
+    """The gap of every contestant with its convention; it decides nothing."""
     question = Question(0, "gap", "", "%", math.inf, False, "")
-    parts, conventions = [], {}
-    for name in names:
-        gap = entry(compared, "contestants", name, "gap")
-        if not isinstance(gap, Mapping) or name in YARDSTICKS:
-            continue
-        ends = [worded(question, finite(gap.get(key)), 2) for key in ("median_percent", "q90_percent")]
-        conventions[str(gap.get("convention") or "")] = None
-        parts.append(
-            f"{in_a_sentence(name)} {ends[0]}"
-            if ends[0] == ends[1]
-            else f"{in_a_sentence(name)} {ends[0]}, {ends[1]} at the 90{THIN}% quantile"
-        )
-    if not parts:
-        return ""
-    convention = "; ".join(filter(None, conventions))
-    return (
-        f"Gap to the optimum ({convention or 'convention not recorded'}; no rule asks for it): "
-        f"{'; '.join(parts)}."
-    )
-
-
-def _at_bound(compared: Mapping[str, Any], names: list[str]) -> str:
-    """Tuned values that lie at a bound of the search."""
-    bound = {name: entry(compared, "contestants", name, "at_bound") or [] for name in names}
-    parts = [
-        f"{in_a_sentence(name)}: {', '.join(map(str, values))}" for name, values in bound.items() if values
+    gaps = {name: entry(compared, "contestants", name, "gap") for name in names if name not in YARDSTICKS}
+    return [
+        {
+            "name": name,
+            "convention": gap.get("convention") or "",
+            "median": worded(question, finite(gap.get("median_percent")), 2),
+            "q90": worded(question, finite(gap.get("q90_percent")), 2),
+        }
+        for name, gap in gaps.items()
+        if isinstance(gap, Mapping)
     ]
-    return (
-        f"At a bound of the search, so that a wider one may be better: {'; '.join(parts)}." if parts else ""
-    )
 
 
-def _broken(compared: Mapping[str, Any], names: list[str]) -> str:
-    """Controllers that another record like this one would have made otherwise."""
-    found = {name: entry(compared, "redesigned", name) or {} for name in names}
-    parts = [
-        f"{in_a_sentence(name)} from {one['broken']} of {one['of']}"
-        for name, one in found.items()
-        if one.get("broken")
-    ]
-    return (
-        "Designed anew from resamples of this record, a controller may cost more than twice as much: "
-        f"{'; '.join(parts)}. Record longer to settle it."
-        if parts
-        else ""
-    )
-
-
-def infeasible(sources: Sources) -> list[str]:
+def infeasible(sources: Sources) -> list[Mapping[str, Any]]:
     """References that the machine cannot hold, each with the actuator that binds."""
-    sentences = []
-    for one in entry(comparison(sources.metrics), "infeasible") or []:
-        asked, reachable = (finite(one.get(key)) for key in ("asked_degC", "reachable_degC"))
-        if not (abs(asked) < 1e4 and abs(reachable) < 1e4):
-            continue
-        sentences.append(
-            f"{one.get('output')} cannot hold {number(asked, 1)}{THIN}°C: at most about "
-            f"{number(reachable, 1)}"
-            f"{THIN}°C is within reach, {one.get('binding')}."
-            if reachable < asked
-            else f"{one.get('output')} cannot hold {number(asked, 1)}{THIN}°C: "
-            f"{number(reachable, 1)}{THIN}°C is "
-            f"the nearest within reach, {one.get('binding')}."
-        )
-    return sentences
+    found = entry(comparison(sources.metrics), "infeasible") or []
+    ends = ("asked_degC", "reachable_degC")
+    return [one for one in found if all(abs(finite(one.get(end))) < 1e4 for end in ends)]
 
 
 # ---- what was tuned and declared
@@ -295,25 +235,15 @@ def _listed(value: Any) -> str:
     return ", ".join(short(v, 3) if isinstance(v, float) else str(v) for v in values)
 
 
-def declared_panel(sources: Sources) -> list[tuple[str, str]]:
+def declared_panel(sources: Sources) -> dict[str, Any]:
     """How contestants were compared."""
     compared, machine = comparison(sources.metrics), sources.declared.machine
-    step, steps = machine.sample_time_s, entry(compared, "steps")
-    rows = [
-        ("Judged on", setting(compared)),
-        ("Run", f"{steps} steps of {step:g}{THIN}s" if steps else ""),
-        (
-            "Settled",
-            f"within {compared['band_degC']:g}{THIN}°C for good; the settled error is of the mean of "
-            "the last 100 steps"
-            if isinstance(compared.get("band_degC"), int | float)
-            else "",
-        ),
-        ("References", ", ".join(f"{o.name} {o.reference:g}" for o in machine.outputs) + f"{THIN}°C"),
-        (
-            "Limits of inputs",
-            f"{min(i.low for i in machine.inputs):g} to {max(i.high for i in machine.inputs):g}{THIN}%",
-        ),
-        ("Seed", str(compared["seed"]) if "seed" in compared else ""),
-    ]
-    return [row for row in rows if row[1]]
+    return {
+        "setting": setting(compared),
+        "steps": entry(compared, "steps"),
+        "band": entry(compared, "band_degC"),
+        "seed": entry(compared, "seed"),
+        "machine": machine,
+        "low": min(i.low for i in machine.inputs),
+        "high": max(i.high for i in machine.inputs),
+    }

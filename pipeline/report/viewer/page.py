@@ -56,7 +56,10 @@ def render(sources: Sources, judged: Judgement) -> Viewer:
         if found.entry["books"]:
             entries.append(found.entry | {"link": link, "size": size, "path": source.path})
         row |= {"rows": number(found.entry["rows"], 0), "link": link, "size": size, "source": source.path}
-        row["left_out"] = _left_out(found.entry)
+        row["left_out"] = [
+            (found.entry["runs_left_out"], "runs"),
+            (found.entry["events_left_out"], "later events"),
+        ]
     script = page.environment().get_template("viewer.js").render().strip()
     text = page.render(
         "viewer.html",
@@ -79,16 +82,6 @@ def library() -> str:
     """uPlot behind its licence."""
     licence = (VENDOR / "LICENSE").read_text(encoding="utf-8").strip()
     return f"/*!\n{licence}\n*/\n" + (VENDOR / "uPlot.iife.min.js").read_text(encoding="utf-8")
-
-
-def _left_out(entry: dict[str, Any]) -> str:
-    """What of a table the viewer does not have, in words; "" where it has all of it."""
-    parts = []
-    if entry["runs_left_out"]:
-        parts.append(f"{number(entry['runs_left_out'], 0)} runs have no room here")
-    if entry["events_left_out"]:
-        parts.append(f"{number(entry['events_left_out'], 0)} later events have no room here")
-    return f"{'; '.join(parts)}: see the Parquet file." if parts else ""
 
 
 # ---- the deciding case
