@@ -2,10 +2,11 @@
 learners, columns on a clock, which column is the time, and tables that are small enough to be read whole."""
 
 import collections
+import contextlib
 import difflib
 import re
 import zipfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -112,6 +113,36 @@ def nearest_names(name: str, names: Iterable[str]) -> str:
     if close:
         return f"the nearest names are {', '.join(close[:5])}"
     return f"it has {', '.join(names[:10])}{' and more' if len(names) > 10 else ''}"
+
+
+def map_sources(
+    what: str, place: str, ours: Iterable[Source], mapping: Mapping[str, tuple[str, str, float, float]]
+) -> dict[str, Source]:
+    """{signal: source} of `ours`, the signals of `what`, from where `mapping` {signal: (source, unit, scale,
+    offset)} at `place` has them. Raises ValueError for a signal that is none of ours, and for another
+    unit."""
+    sources = {source.signal: source for source in ours}
+    for name, mapped in mapping.items():
+        if name not in sources:
+            raise ValueError(f"{place}.mapping.{name} is no signal of {what}; {nearest_names(name, sources)}")
+        if mapped[1] != sources[name].unit:
+            raise ValueError(
+                f"{place}.mapping.{name}.unit is {mapped[1]} but {name} is in {sources[name].unit}; convert "
+                f"with scale and offset, and write unit: {sources[name].unit}"
+            )
+        sources[name] = Source(name, *mapped)
+    return sources
+
+
+@contextlib.contextmanager
+def told_of(path: Path) -> Iterator[None]:
+    """A disk's error at `path` as a sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise ValueError(
+            f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
+        ) from None
 
 
 # the configuration that a klippy.log begins with after a rollover has some 30 kB

@@ -38,12 +38,13 @@ from pipeline.recordings.formats import CALENDAR_S, FileColumns, Note, Source, f
 from pipeline.recordings.mcap_files import (
     CHUNK,
     MESSAGE,
-    MESSAGE_HEAD,
+    MESSAGE_BODY,
     RECORD_HEAD,
     McapFile,
     Topic,
     TopicColumns,
     resolve,
+    split_records,
     topics,
     unpack_chunk,
 )
@@ -452,16 +453,6 @@ class Frames:
                         )
                         yield (time - self.start_ns) / 1e9, picture
 
-    def pick(self, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
-        """(number, frame) of the pictures with these numbers; only they are decoded, and one that cannot be
-        decoded is left out."""
-        for number, (_, picture) in enumerate(self.pictures()):
-            if number in numbers:
-                try:
-                    yield number, gray(picture)
-                except UnreadableMessage:
-                    continue
-
     def notes(self) -> list[Note]:
         """What the last walk left out."""
         if not self.unreadable:
@@ -491,15 +482,13 @@ class Frames:
             stream.seek(offset)
             head = stream.read(9)
             record = stream.read(RECORD_HEAD.unpack(head)[1])
-            record_bytes, pos = unpack_chunk(record, check=False) if head[0] == CHUNK else (head + record, 0)
-            content = memoryview(record_bytes)
-            while pos < len(content):
-                length = RECORD_HEAD.unpack_from(content, pos)[1]
-                if content[pos] == MESSAGE:
-                    _, _, channel, _, log_time, publish_time = MESSAGE_HEAD.unpack_from(content, pos)
-                    if channel == number:
-                        yield log_time, publish_time, content[pos + 31 : pos + 9 + length]
-                pos += 9 + length
+            content, begin = unpack_chunk(record, check=False) if head[0] == CHUNK else (head + record, 0)
+            for opcode, body in split_records(memoryview(content)[begin:]):
+                if opcode != MESSAGE:
+                    continue
+                channel, _, log_time, publish_time = MESSAGE_BODY.unpack_from(body)
+                if channel == number:
+                    yield log_time, publish_time, body[22:]
         except (struct.error, IndexError, UnicodeDecodeError, UnreadableMessage):
             raise ValueError(
                 f"{self.path}: the record at byte {offset} is not what it was a moment ago; "

@@ -7,8 +7,6 @@ of now (buffer_time). The lines before that byte have moved when the planned mot
     E(t + buffer_time(t)) = E of the lines before sd_pos(t)
     feed(t) = (E(t + dt) - E(t)) / dt                            dt: to the next Stats line
 
-A Klipper of 2024 counts characters in sd_pos instead of bytes: it is off where a file is not ASCII.
-
 The fan is that of the last M106 or M107 so far, or of a macro whose text in the configuration has one. It is
 0 when Klipper starts, and after a print as the file left it. Between prints and in a pause the feed is 0.
 
@@ -339,39 +337,6 @@ def _choose(
     )
 
 
-def _in_bytes(path: Path, positions: np.ndarray) -> np.ndarray:
-    """Positions (n,), ascending, that count characters, in bytes; as they are in a file of ASCII alone. The
-    first beyond the file's end and all after it are one byte beyond it."""
-    found, characters, offset = [], 0, 0
-    wanted = positions.astype(np.int64)
-    with path.open("rb") as stream:
-        while data := stream.read(BLOCK):
-            begins = np.flatnonzero((np.frombuffer(data, np.uint8) & 0xC0) != 0x80)
-            here = wanted[len(found) :] - characters
-            found += (offset + begins[here[here < len(begins)]]).tolist()
-            characters, offset = characters + len(begins), offset + len(data)
-    found += [offset if position == characters else offset + 1 for position in wanted[len(found) :].tolist()]
-    return np.array(found, np.int64)
-
-
-def _counted_in_characters(
-    candidates: Sequence[Path], positions: np.ndarray, where: np.ndarray, prints: list[Print], i: int
-) -> Path | None:
-    """The one file that fits print i at the rows `where` if its positions count characters. Positions and
-    print are then in bytes."""
-    of, own = prints[i], np.unique(np.r_[prints[i].start, positions[where], max(prints[i].end, 0)])
-    fitting = []
-    for path in candidates:
-        moved = dict(zip(own.tolist(), _in_bytes(path, own).tolist(), strict=True))
-        at, end = np.array([moved[int(x)] for x in positions[where]]), moved.get(of.end, -1)
-        if any(old != new for old, new in moved.items()) and not misfit(path, np.unique(at), end, of.size):
-            fitting.append((path, at, of._replace(start=moved[of.start], end=end)))
-    if len(fitting) != 1:
-        return None
-    ((path, positions[where], prints[i]),) = fitting
-    return path
-
-
 # ---- signals
 
 
@@ -389,7 +354,6 @@ def print_signals(
     """Part fan and filament feed at the rows of a log; NaN in a print whose file is not known. `start_s` is
     the time of day of the first row, NaN if it is not known."""
     notes: list[Note] = []
-    rows, prints = rows._replace(position=rows.position.copy()), list(prints)
     indices = [int(i) for i in dict.fromkeys(rows.print_index.tolist()) if i >= 0]
     if not indices:
         message = (
@@ -415,9 +379,9 @@ def print_signals(
     return PrintSignals({FAN: fan, FEED: filament}, notes, used + histories)
 
 
-def _files_of(log, rows: PrintRows, prints: list[Print], places, start_s: float, notes: list[Note]):
+def _files_of(log, rows: PrintRows, prints: Sequence[Print], places, start_s: float, notes: list[Note]):
     """({print: its file}, {print: its job}, the histories that were read); a note for each reason why a print
-    has no file. Positions that count characters are in bytes after it."""
+    has no file."""
     beside = companions(log)
     jobs, histories = [], []
     for path in (path for path in beside if path.suffix.lower() == ".json"):
@@ -435,7 +399,6 @@ def _files_of(log, rows: PrintRows, prints: list[Print], places, start_s: float,
         name = job_of[i].get("filename", "") or prints[i].name
         try:
             path, reason = _choose(candidates, name, positions, prints[i])
-            path = path or _counted_in_characters(candidates, rows.position, where, prints, i)
         except OSError as error:
             path, reason = None, f"a G-code file cannot be read ({error.strerror}); copy it again"
         if path:

@@ -408,18 +408,18 @@ def printer_pids(
     pids: dict[str, dict] = {}
     logs = [r.name for r in results if not r.reason and file_format(folder / r.name) == "klippy.log"]
     for name in logs:
-        for pid in [heater.pid for heater in printer_heaters(folder / name) if heater.pid]:
-            u, y = of.get(f"{pid.heater}.pwm"), of.get(f"{pid.heater}.temp")
-            if u is None or y is None or u.signal not in inputs:
+        for heater in printer_heaters(folder / name):
+            u, y = of.get(f"{heater.heater}.pwm"), of.get(f"{heater.heater}.temp")
+            if not heater.gains or u is None or y is None or u.signal not in inputs:
                 continue
-            gains = [gain * u.scale / y.scale for gain in pid[1:4]]
+            gains = [gain * u.scale / y.scale for gain in heater.gains]
             pids[u.signal] = {
                 "recording": name,
                 "input": u.signal,
                 "output": y.signal,
                 **dict(zip(("Kp", "Ki", "Kd"), gains, strict=True)),
-                "most_percent": pid.most_percent * u.scale,
-                "smooth_s": pid.smooth_s,
+                "most_percent": heater.most_percent * u.scale,
+                "smooth_s": heater.smooth_s,
             }
     return {"heaters": list(pids.values())} if pids else {}
 

@@ -29,9 +29,10 @@ from pipeline.recordings.formats import (
     file_format,
     nearest_names,
     select,
+    told_of,
 )
 from pipeline.recordings.inspection import inspect
-from pipeline.recordings.mcap_files import check_magic, mcap_columns, read_bag
+from pipeline.recordings.mcap_files import read_mcap
 from pipeline.recordings.other_formats import LOADERS
 from pipeline.recordings.parquet_files import read_parquet
 from pipeline.recordings.printed_gcode import NOT_RECORDED, UNITS
@@ -78,12 +79,8 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal
     kind = file_format(path)
     named = SUFFIXES.get(path.suffix.lower(), kind)
     names = list(dict.fromkeys(source.source for source in sources))
-    try:
+    with told_of(path):
         columns, places, messages, notes = _file_columns(path, kind, names, time, decimal)
-    except OSError as error:
-        raise ValueError(
-            f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
-        ) from None
     if kind != named:
         message = (
             f"the file is named {path.suffix.lower()} but begins as {NAMES.get(kind, kind)} does, "
@@ -112,12 +109,8 @@ def _file_columns(
 ) -> tuple[list[FileColumns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
     """Columns on their clocks, {source: (name of its columns, name in them)}, {name: count of messages or
     rows} and notes of a file of that kind."""
-    if kind == "mcap":
-        with path.open("rb") as stream:
-            check_magic(path, stream.read(16))
-        return mcap_columns(path, names, time)
-    if kind == "bag":
-        return read_bag(path, names, time)
+    if kind in ("mcap", "bag"):
+        return read_mcap(path, names, time)
     if kind == "csv":
         columns, notes = read_groups(path, names, time, decimal)
     elif kind in LOADERS:

@@ -18,7 +18,7 @@ import joblib
 import numpy as np
 
 from pipeline.recordings.excluded import readable
-from pipeline.recordings.formats import Note, Source
+from pipeline.recordings.formats import Note, Source, map_sources, told_of
 from pipeline.recordings.images import Frames, check_overlap, read_frames, span_of, tables_of, write_frames
 from pipeline.store import artifacts
 from pipeline.store.params import Mapped
@@ -182,30 +182,13 @@ def _crc(pairs: dict[str, str]) -> str:
 def open_trial(
     path: str | Path, *, image: str, time: str, mapping: Mapping[str, Mapped], unreadable_share: float
 ) -> TrialRecording:
-    """A recording through the topics of section `camera`. Raises ValueError as read_trial does."""
+    """A recording through the topics of section `camera`. Raises ValueError as read_trial does, and for a
+    signal in `mapping` that no trial has, and for another unit."""
+    mapped = {name: (m.source, m.unit, m.scale, m.offset) for name, m in mapping.items()}
+    sources = map_sources("a trial", "params.yaml: camera.topics", SOURCES, mapped)
     return read_trial(
-        path, sources=sources(mapping), image=image, time=time, unreadable_share=unreadable_share
+        path, sources=tuple(sources.values()), image=image, time=time, unreadable_share=unreadable_share
     )
-
-
-def sources(mapping: Mapping[str, Mapped]) -> tuple[Source, ...]:
-    """Where a recording has our signals, `mapping` in place of our own topics. Raises ValueError for a signal
-    that no trial has, and for another unit."""
-    by_signal = {source.signal: source for source in SOURCES}
-    for name, place in mapping.items():
-        if name not in by_signal:
-            raise ValueError(
-                f"params.yaml: camera.topics.mapping.{name} is no signal of a trial; "
-                f"map {', '.join(list(by_signal)[:-1])}"
-            )
-        if place.unit != by_signal[name].unit:
-            raise ValueError(
-                f"params.yaml: camera.topics.mapping.{name}.unit is {place.unit} but {name} is in "
-                f"{by_signal[name].unit}; convert with scale and offset, "
-                f"and write unit: {by_signal[name].unit}"
-            )
-        by_signal[name] = Source(name, place.source, place.unit, place.scale, place.offset)
-    return tuple(by_signal.values())
 
 
 def trial_paths(folder: Path) -> list[Path]:
@@ -342,7 +325,7 @@ def read_trial(
     path = Path(path)
     # only the true flow, which no machine knows, may be absent if its source is ours
     optional = {FLOW.signal} if FLOW in sources else ()
-    try:
+    with told_of(path):
         frames, signals, metadata, notes = read_frames(
             path,
             sources,
@@ -352,10 +335,6 @@ def read_trial(
             unreadable_share=unreadable_share,
             optional=optional,
         )
-    except OSError as error:
-        raise ValueError(
-            f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
-        ) from None
     spans = {name: span_of(time_s) for name, (time_s, _) in signals.items()}
     check_overlap(path, span_of(frames.time_s), spans)
     first, last = spans[COMMAND.signal]

@@ -93,19 +93,6 @@ def test_feed_and_fan_are_those_of_the_motion(tmp_path, slicer, end, high_s):
     assert {0.0, 50.0, 100.0} <= set(table.values[FAN].tolist())
 
 
-def test_positions_that_count_characters_find_a_file_with_other_letters(tmp_path, printed):
-    machine, files = printed
-    files = {name: content.replace("ü".encode(), b"ue") for name, content in files.items()}
-    plain = load_klippy(write(tmp_path / "plain", machine, files))
-    # as many characters in more bytes
-    spelt = {name: content.replace(b";LAYER", ";LÁYĚR".encode()) for name, content in files.items()}
-    assert all(len(spelt[name]) > len(content) + 10 for name, content in files.items())
-    table = load_klippy(write(tmp_path / "spelt", machine, spelt))
-    assert not messages(table, NOT_RECORDED)
-    for name in (FAN, FEED):
-        np.testing.assert_array_equal(table.values[name], plain.values[name])
-
-
 def test_in_a_pause_and_between_prints_nothing_is_fed(tmp_path, printed):
     machine, files = printed
     table = load_klippy(write(tmp_path, machine, files))
