@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.recordings.formats import FileColumns, Note
+from pipeline.recordings.formats import CALENDAR_S, FileColumns, Note
 
 HOUR_S = 3600
 # a clock that runs on for no more than so many samples before it falls back is not one clock
@@ -252,6 +252,17 @@ def _forward_rows(group: FileColumns, notes: list[Note]) -> np.ndarray:
         notes.append(_note("repeated", clashes, sorted_rows.place, message))
         order = np.delete(order, clashes)
     return order
+
+
+def start_of(first: float, second: float, zones: str, notes: list[Note]) -> float:
+    """The instant from which time is counted: 0, or the first whole second of a calendar, which is noted.
+    `second` is one in the unit of `first`."""
+    if first <= CALENDAR_S * second:
+        return 0
+    zero = np.datetime64(int(first // second), "s")
+    message = f"time is counted from {zero} ({zones}, as the recording's clock says)"
+    notes.append(Note("clock", "", 1, message))
+    return first // second * second
 
 
 # ---- clocks that are refused

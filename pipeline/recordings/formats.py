@@ -134,6 +134,18 @@ def map_sources(
     return sources
 
 
+def convert(path: Path, source: Source, recorded: np.ndarray) -> np.ndarray:
+    """The recorded values (n,) in the signal's unit. Raises ValueError if all are missing."""
+    if not np.isfinite(recorded).any():
+        raise ValueError(
+            f"{path}: {source.source} should hold numbers for {source.signal} but all of its "
+            f"{len(recorded)} values are missing; map another source"
+        )
+    if (source.scale, source.offset) == (1.0, 0.0):
+        return recorded
+    return recorded * source.scale + source.offset
+
+
 @contextlib.contextmanager
 def told_of(path: Path) -> Iterator[None]:
     """A disk's error at `path` as a sentence."""

@@ -17,7 +17,6 @@ import binascii
 import contextlib
 import functools
 import heapq
-import math
 import operator
 import os
 import struct
@@ -33,8 +32,8 @@ import orjson
 from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
-from pipeline.recordings.clocks import check_clock
-from pipeline.recordings.formats import CALENDAR_S, FileColumns, Note, Source, file_format
+from pipeline.recordings.clocks import check_clock, start_of
+from pipeline.recordings.formats import FileColumns, Note, Source, convert, file_format
 from pipeline.recordings.mcap_files import (
     CHUNK,
     MESSAGE,
@@ -453,6 +452,14 @@ class Frames:
                         )
                         yield (time - self.start_ns) / 1e9, picture
 
+    def pick(self, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
+        """(number, frame) of the pictures with these numbers; only they are decoded, and one that cannot be
+        decoded is left out."""
+        for number, (_, picture) in enumerate(self.pictures()):
+            if number in numbers:
+                with contextlib.suppress(UnreadableMessage):
+                    yield number, gray(picture)
+
     def notes(self) -> list[Note]:
         """What the last walk left out."""
         if not self.unreadable:
@@ -600,22 +607,12 @@ def span_of(time_s: np.ndarray) -> tuple[float, float]:
 
 def _values(path: Path, source: Source, recorded: np.ndarray, notes: list[Note]) -> np.ndarray:
     """The recorded values in the signal's unit. A missing value is NaN, and counted."""
-    missing = int(np.count_nonzero(~np.isfinite(recorded)))
-    if missing == len(recorded):
-        raise ValueError(
-            f"{path}: {source.source} should hold numbers for {source.signal} but all of its {missing} "
-            "values are missing; map another"
-        )
+    values, present = convert(path, source, recorded), np.isfinite(recorded)
+    missing = int(np.count_nonzero(~present))
     if missing:
-        notes.append(
-            Note(
-                "missing",
-                source.signal,
-                missing,
-                f"{missing} of {len(recorded)} values of {source.source} are missing",
-            )
-        )
-    return np.where(np.isfinite(recorded), recorded * source.scale + source.offset, np.nan)
+        message = f"{missing} of {len(recorded)} values of {source.source} are missing"
+        notes.append(Note("missing", source.signal, missing, message))
+    return np.where(present, values, np.nan)
 
 
 def _start(path: Path, groups: Sequence[FileColumns], notes: list[Note]) -> int:
@@ -625,12 +622,7 @@ def _start(path: Path, groups: Sequence[FileColumns], notes: list[Note]) -> int:
     """
     for group in groups:
         check_clock(path, group)
-    first = min(int(group.time[0]) for group in groups)
-    if first <= CALENDAR_S * 1e9:
-        return 0
-    zero = np.datetime64(first // 10**9, "s")
-    notes.append(Note("clock", "", 1, f"time is counted from {zero} (UTC, as the recording's clock says)"))
-    return first // 10**9 * 10**9
+    return int(start_of(min(group.time[0] for group in groups), 10**9, "UTC", notes))
 
 
 def damage(path: Path) -> str:
@@ -697,18 +689,14 @@ def _pad(body: bytes) -> bytes:
 def tables_of(
     path: str | Path, time_s: np.ndarray, signals: Sequence[tuple[Source, np.ndarray]]
 ) -> dict[str, dict[str, np.ndarray]]:
-    """{topic: {field: values}}, checked."""
+    """{topic: {field: values}}. Raises ValueError for values that are not finite, which no machine can be
+    given, and for times that do not run forward."""
     time = np.asarray(time_s, float)
     tables: dict[str, dict[str, np.ndarray]] = {}
     for name, values in [
         ("time_s", time),
         *((source.signal, np.asarray(values, float)) for source, values in signals),
     ]:
-        if values.shape != time.shape or time.ndim != 1 or not time.size:
-            raise ValueError(
-                f"{path}: {name} should have one value for each of {time.size} times but has "
-                f"shape {values.shape}"
-            )
         if not np.isfinite(values).all():
             raise ValueError(
                 f"{path}: {name} is not finite at sample {np.flatnonzero(~np.isfinite(values))[0]}; "
@@ -736,14 +724,9 @@ def write_frames(
     """Writes one recording.
 
     `tables` {topic: {field: (T,)}} are those of `tables_of`, `types` {topic: message type}, `pictures`
-    (encoding, frames (time_s, (height, width))). Frames are taken one by one, so that memory is that of a
-    chunk. Raises ValueError, with no file written, for an unknown encoding and for frames that
-    `_frame_messages` refuses.
+    (encoding, frames (time_s, (height, width))), 8 bits for JPEG, else 8 or 16. Frames are taken one by one,
+    so that memory is that of a chunk.
     """
-    if pictures and pictures[0] not in ENCODERS:
-        raise ValueError(
-            f"{path}: the encoding should be jpeg, png or raw but is {pictures[0]!r}; name one of them"
-        )
     with beside(path) as temporary:
         # by its name: only artifacts opens a file to write. Chunks, summary and metadata have a CRC each; one
         # over all of it would be summed twice
@@ -762,9 +745,7 @@ def write_frames(
             if encoding == "raw":
                 name, text, topic = "Image", IMAGE, IMAGE_TOPIC
             channel = _channel(writer, topic, f"sensor_msgs/msg/{name}", text)
-            streams.append(
-                _frame_messages(path, channel, encoding, frames, span_of(np.asarray(time_s, float)))
-            )
+            streams.append(_frame_messages(channel, encoding, frames))
         for sequence, (stamp, channel, message) in enumerate(
             heapq.merge(*streams, key=operator.itemgetter(0))
         ):
@@ -790,42 +771,15 @@ def _signal_messages(
 
 
 def _frame_messages(
-    path, channel: int, encoding: str, frames: Iterable, span: tuple[float, float]
+    channel: int, encoding: str, frames: Iterable[tuple[float, np.ndarray]]
 ) -> Iterator[tuple[int, int, bytes]]:
-    """CDR messages of the frames. Each frame is checked, and at the end the overlap with the signals'
-    time."""
+    """CDR messages of the frames."""
     ending, settings = ENCODERS[encoding]
-    kind, last, first = None, -1, math.nan
-    for k, (time, frame) in enumerate(frames):
-        stamp = round(time * 1e9) if math.isfinite(time) else -1
-        if stamp <= last:
-            raise ValueError(
-                f"{path}: frame {k} is at {time:g} s but frames should run forward from 0 s or later; "
-                "sort them or shift the time"
-            )
-        if (
-            frame.ndim != 2
-            or frame.dtype not in (np.uint8, np.uint16)
-            or (encoding == "jpeg" and frame.dtype != np.uint8)
-        ):
-            wanted = "uint8" if encoding == "jpeg" else "uint8 or uint16"
-            raise ValueError(
-                f"{path}: frame {k} should be (height, width) of {wanted} but is {frame.shape} of "
-                f"{frame.dtype}; make it gray"
-            )
-        kind = kind or (frame.shape, frame.dtype)
-        if (frame.shape, frame.dtype) != kind:
-            raise ValueError(
-                f"{path}: frame {k} is {frame.shape} of {frame.dtype} but the first is {kind[0]} of "
-                f"{kind[1]}; write one size"
-            )
+    for time, frame in frames:
+        stamp = round(time * 1e9)
         head = header(stamp, FRAME_ID)
         if ending:
             message = image_bytes(head, encoding, cv2.imencode(ending, frame, settings)[1])
         else:
             message = image(head, frame)
-        last, first = stamp, time if k == 0 else first
         yield stamp, channel, message
-    if last < 0:
-        raise ValueError(f"{path}: a trial should have frames but there is none; give at least one")
-    check_overlap(path, (first, last / 1e9), {"signals": span})

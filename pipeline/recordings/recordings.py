@@ -12,10 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.recordings.clocks import repair_topics
+from pipeline.recordings.clocks import repair_topics, start_of
 from pipeline.recordings.csv_files import read_groups
 from pipeline.recordings.formats import (
-    CALENDAR_S,
     NAMES,
     SUFFIXES,
     FileColumns,
@@ -26,6 +25,7 @@ from pipeline.recordings.formats import (
     Source,
     Table,
     WholeTable,
+    convert,
     file_format,
     nearest_names,
     select,
@@ -155,12 +155,8 @@ def _clocks(columns: Sequence[FileColumns], notes: list[Note]) -> dict[str, np.n
     first = min(group.time[0] for group in columns)
     on_calendar = columns[0].time.dtype == np.int64
     unit = 10**9 if on_calendar else 1.0
-    start = first // unit * unit if first > CALENDAR_S * unit else 0
-    if start:
-        zero = np.datetime64(int(start // unit), "s")
-        zones = ", ".join(sorted({group.zone or "of no zone" for group in columns}))
-        message = f"time is counted from {zero} ({zones}, as the recording's clock says)"
-        notes.append(Note("clock", "", 1, message))
+    zones = ", ".join(sorted({group.zone or "of no zone" for group in columns}))
+    start = start_of(first, unit, zones, notes)
     return {group.name: (group.time - start if start else group.time) / unit for group in columns}
 
 
@@ -178,15 +174,7 @@ def _signal(
             f"{path}: {source.source} is in °F but the mapping takes it as {source.unit} with scale "
             f"{source.scale:g}; set scale: 0.555556 and offset: -17.7778"
         )
-    present = np.isfinite(recorded)
-    if not present.any():
-        raise ValueError(
-            f"{path}: {source.source} should hold numbers for {source.signal} but all of its "
-            f"{len(recorded)} values are missing; map another source"
-        )
-    values = (
-        recorded if (source.scale, source.offset) == (1.0, 0.0) else recorded * source.scale + source.offset
-    )
+    values, present = convert(path, source, recorded), np.isfinite(recorded)
     if present.all():
         return time, values
     where = np.flatnonzero(present)

@@ -116,10 +116,8 @@ def test_what_is_written_is_in_the_inspection(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"encoding": "gif"}, "should be jpeg, png or raw but is 'gif'"),
-        ({"flow_percent": np.full(3, 100.0)}, "one value for each of 18 times"),
         ({"flow_percent": np.full(COUNT, np.nan)}, "not finite at sample 0"),
-        ({"frames": []}, "there is none; give at least one"),
+        ({"time_s": TIME[::-1]}, "time_s should run forward from 0 or later"),
     ],
 )
 def test_what_cannot_be_written_is_refused_and_leaves_nothing(tmp_path, changes, said):
@@ -345,8 +343,8 @@ def test_files_that_are_no_such_recording_are_refused(tmp_path):
     assert "a.mcap" in refusal(tmp_path / "raw")
     film(path, frames=((100 + time, frame) for time, frame in pictures()), time_s=100 + TIME)
     read(tmp_path / "raw")
-    with pytest.raises(ValueError, match="do not overlap in time"):
-        film(path, frames=((100 + time, frame) for time, frame in pictures()))
+    film(path, frames=((100 + time, frame) for time, frame in pictures()))
+    assert "do not overlap in time" in refusal(tmp_path / "raw")
 
 
 def test_what_was_looked_at_before_is_not_looked_at_again(tmp_path, monkeypatch):
