@@ -11,6 +11,7 @@ import csv
 import functools
 import itertools
 import re
+from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -81,29 +82,16 @@ _PAGES = {
 }
 
 
-class Growing:
-    """Columns (n,) that grow in place as parts of a file come in. (Joining the parts at the end would need
-    twice the memory.)"""
+def extend(columns: Sequence[array], parts: Sequence[np.ndarray]) -> None:
+    """Appends parts (n,) to columns, which grow in place. (Joining the parts at the end would need twice the
+    memory.)"""
+    for column, part in zip(columns, parts, strict=True):
+        column.frombytes(np.ascontiguousarray(part, column.typecode).view(np.uint8))
 
-    def __init__(self, kinds: Sequence[type], expected: int = 0):
-        self.count = 0
-        self._columns = [np.empty(max(expected, 1), kind) for kind in kinds]
 
-    def append(self, *parts: np.ndarray) -> None:
-        end = self.count + len(parts[0])
-        if end > len(self._columns[0]):
-            self._resize(end + end // 4)
-        for column, part in zip(self._columns, parts, strict=True):
-            column[self.count : end] = part
-        self.count = end
-
-    def _resize(self, size: int) -> None:
-        for column in self._columns:
-            column.resize(size, refcheck=False)
-
-    def finished(self) -> list[np.ndarray]:
-        self._resize(self.count)
-        return self._columns
+def as_numpy(columns: Sequence[array]) -> list[np.ndarray]:
+    """The columns (n,), without a copy."""
+    return [np.frombuffer(column, column.typecode) for column in columns]
 
 
 class Clock(NamedTuple):
@@ -585,8 +573,6 @@ def _first_row(
 # ---- rows of plain numbers by Arrow, which reads only what the slow way reads in the same manner
 
 BLOCK_BYTES = 1 << 20
-# a first block of short rows may promise what is not there
-MOST_EXPECTED = 1 << 22
 # Arrow knows zones up to 24 h; ours end at 14, and some programs write a fraction behind a hyphen
 _FAR_ZONE = r":\d\d(\.\d+)?[+-](1[5-9]|2\d|14:?(0[1-9]|[1-9]\d))"
 _ISO = re.compile(r"\d{4}-\d\d-\d\d(?:[T ]\d\d:\d\d(?::\d\d(?:\.\d{1,9})?)?)?(Z|[+-]\d\d(?::?\d\d)?)?$")
@@ -609,7 +595,7 @@ def read_plain(
     if dates in places:
         return None
     read = list(dict.fromkeys([*places, *([] if clock is None else [clock.place])]))
-    parts: Growing | None = None
+    parts: list[array] = []
     broken: list[pa.csv.InvalidRow] = []
     try:
         for batch in _batches(path, layout, read, dates, broken):
@@ -624,18 +610,13 @@ def read_plain(
             ]
             if clock is None and np.isnan(columns).all(axis=0).any():
                 return None  # a blank row is no sample
-            if parts is None:
-                # as many rows as the first block promises, so that growing moves nothing
-                expected = int(len(batch) * max(1.0, 1.02 * path.stat().st_size / BLOCK_BYTES)) + 1
-                parts = Growing([column.dtype.type for column in columns], min(expected, MOST_EXPECTED))
-            parts.append(*columns)
-        if parts is None:
-            return None
-        if broken:
+            parts = parts or [array(column.dtype.char) for column in columns]
+            extend(parts, columns)
+        if broken and parts:
             notes.append(_last_line_note(path, layout, broken[0]))
     except (_NotPlain, pa.ArrowException, UnicodeError):
         return None
-    return dict(zip(read, parts.finished(), strict=True))
+    return dict(zip(read, as_numpy(parts), strict=True)) if parts else None
 
 
 def _batches(
@@ -767,7 +748,7 @@ def read_long(path: Path, layout: CsvLayout, wanted: Sequence[str]) -> tuple[lis
     Raises ValueError with the line for text in place of a number or a time.
     """
     at, codes = {name: i for i, name in enumerate(layout.names)}, {name: i for i, name in enumerate(wanted)}
-    columns, notes = Growing([np.int64, float, np.int32, np.int32]), []
+    columns, notes = [array(code) for code in "qdii"], []
     events: collections.Counter[str] = collections.Counter()
     invalid: collections.Counter[str] = collections.Counter()
 
@@ -789,8 +770,8 @@ def read_long(path: Path, layout: CsvLayout, wanted: Sequence[str]) -> tuple[lis
             invalid.update(itertools.compress(owners, bad))
             values[bad] = np.nan
         times = _log_times(path, layout, {name: fields[i] for name, i in at.items()}, lines)
-        columns.append(times, values, np.array(lines), np.array([codes[owner] for owner in owners]))
-    times, values, lines, owners = columns.finished()
+        extend(columns, [times, values, np.array(lines), np.array([codes[owner] for owner in owners])])
+    times, values, lines, owners = as_numpy(columns)
     for name, count in invalid.items():
         message = f"{count} values of {name} are marked as not valid and are missing"
         notes.append(Note("invalid", "", count, message))
@@ -1034,7 +1015,7 @@ def _rows_one_by_one(
     which knows every word and names the line of a fault. A unit beside the numbers goes into `units`, which
     has the names of the columns."""
     is_numeric, texts = clock is not None and bool(clock.decimal), []
-    columns = Growing([np.int32, *[float] * (len(units) + is_numeric)])
+    columns = [array("i"), *(array("d") for _ in range(len(units) + is_numeric))]
     switches: dict[str, set[str]] = {}
     styles: dict[str, tuple[str, str]] = {}
 
@@ -1055,7 +1036,7 @@ def _rows_one_by_one(
             parts.append(floats(path, clock.name, times, layout.decimal, lines, {}))
         else:
             texts += times
-        columns.append(np.array(lines), *parts)
+        extend(columns, [np.array(lines), *parts])
     for name, words in switches.items():
         message = f"{name} is written as {' and '.join(sorted(words))}, which were read as 1 and 0"
         notes.append(Note("words", "", 1, message))
@@ -1064,7 +1045,7 @@ def _rows_one_by_one(
             units[name] = unit
             message = f"{name} is written with its unit {unit}, which was left out"
             notes.append(Note("words", "", 1, message))
-    numbers, *values = columns.finished()
+    numbers, *values = as_numpy(columns)
     return dict(zip(units, values, strict=False)), numbers, values[-1] if is_numeric else texts
 
 

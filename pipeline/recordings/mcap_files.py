@@ -15,6 +15,7 @@ import os
 import re
 import struct
 import zlib
+from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, TypeVar
@@ -26,7 +27,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
-from pipeline.recordings.csv_files import Growing
+from pipeline.recordings.csv_files import as_numpy, extend
 from pipeline.recordings.formats import METADATA, FileColumns, Note, nearest_names, seconds
 from pipeline.recordings.messages import (
     Channel,
@@ -689,7 +690,7 @@ class TopicColumns:
         self.fields: dict[str, list[str]] = {}
         self.clocks: dict[str, list[str]] = {}
         self.decoders: dict[int, Decode] = {}
-        self.parts: dict[int, Growing] = {}
+        self.parts: dict[int, list[array]] = {}
         self.bad: collections.Counter[str] = collections.Counter()  # messages that do not fit their schema
         self.backwards: collections.Counter[str] = collections.Counter()
 
@@ -723,8 +724,7 @@ class TopicColumns:
                 raise ValueError(
                     f"{self.file.path}: topic {topic} cannot be read because {error}; map another topic"
                 ) from None
-            expected = min((self.file.promised or {}).get(number, 0), MOST_EXPECTED)
-            self.parts[number] = Growing([np.int64, *[float] * len(names)], expected)
+            self.parts[number] = [array("q"), *(array("d") for _ in names)]
         try:
             values, sound = _decode(self.decoders[number], messages.data, len(names) + len(clock))
         except ValueError as error:
@@ -737,7 +737,7 @@ class TopicColumns:
             times = published[sound]
         else:
             times = np.array(messages.log_time, np.uint64).astype(np.int64)[sound]
-        self.parts[number].append(times, *values[:, : len(names)].T)
+        extend(self.parts[number], [times, *values[:, : len(names)].T])
         self.bad[topic] += len(messages.data) - len(times)
         self.backwards[topic] += int(np.count_nonzero(np.diff(published) < 0))
 
@@ -746,7 +746,7 @@ class TopicColumns:
         name, and refused."""
         path, pieces = self.file.path, []
         for number in [number for number in self.parts if self.file.channels[number].topic == topic]:
-            time, *values = self.parts.pop(number).finished()
+            time, *values = as_numpy(self.parts.pop(number))
             if len(time):
                 columns = dict(zip(self.fields[topic], values, strict=True))
                 pieces.append(FileColumns(str(number), time, columns, str))

@@ -1,5 +1,6 @@
 """Parquet files of other people's programs, read a part at a time."""
 
+from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from pipeline.recordings.csv_files import Growing, check_one_signal, naming_columns
+from pipeline.recordings.csv_files import as_numpy, check_one_signal, extend, naming_columns
 from pipeline.recordings.formats import (
     FileColumn,
     FileColumns,
@@ -23,8 +24,7 @@ from pipeline.recordings.formats import (
 from pipeline.recordings.instants import instants
 
 ROWS_AT_ONCE = 50_000
-# an index may promise what is not there
-MOST_EXPECTED, MOST_IN_ONE_PIECE = 1 << 26, 1 << 22
+MOST_IN_ONE_PIECE = 1 << 22
 
 
 def _parquet(path: Path) -> pq.ParquetFile:
@@ -170,10 +170,10 @@ def _values(path: Path, file: pq.ParquetFile, kinds: dict[str, type], clock: str
             table = _flat(file.read_row_group(0, columns, use_threads=False))
             if table.num_rows:
                 return {name: _array(path, name, _one_chunk(table[name]), clock) for name in kinds}
-        parts = Growing(list(kinds.values()), min(file.metadata.num_rows, MOST_EXPECTED))
+        parts = [array(np.dtype(kind).char) for kind in kinds.values()]
         for batch in file.iter_batches(ROWS_AT_ONCE, columns=columns, use_threads=False):
             table = _flat(pa.Table.from_batches([batch]))
-            parts.append(*(_array(path, name, table[name], clock) for name in kinds))
+            extend(parts, [_array(path, name, table[name], clock) for name in kinds])
     except MemoryError:
         raise
     except (OSError, pa.ArrowException) as error:
@@ -181,9 +181,9 @@ def _values(path: Path, file: pq.ParquetFile, kinds: dict[str, type], clock: str
             f"{path}: a column cannot be read ({_first_line(error)}); the file is damaged, "
             "so copy the recording again"
         ) from None
-    if not parts.count:
+    if not len(parts[0]):
         raise ValueError(f"{path}: the table should have rows but has none; record it again or remove it")
-    return dict(zip(kinds, parts.finished(), strict=True))
+    return dict(zip(kinds, as_numpy(parts), strict=True))
 
 
 def _one_chunk(column: pa.ChunkedArray) -> pa.ChunkedArray:
