@@ -188,13 +188,20 @@ def list_layout(path: Path, is_header: Callable[[list[str]], bool]) -> CsvLayout
     written = [i for i, row in enumerate(fields) if any(row) and not remark[i]]
     heads = [i for i, row in enumerate(fields) if is_header(row)] or written
     if not heads or not any(i > heads[0] for i in written):
-        content = "a header" if heads else "only blank or comment lines"
-        raise ValueError(
-            f"{path}: line 2 on should hold rows of numbers, but the file has {content} and no data; "
-            "record it again or remove it"
-        )
+        raise _without_rows(path, len(written))
     names = [field.strip() for field in fields[heads[0]]]
     return layout._replace(names=names, units=[""] * len(names), skip=heads[0] + 1)
+
+
+def _without_rows(path: Path, lines: int) -> ValueError:
+    """The refusal of a file that has so many lines of text alone."""
+    content = (
+        f"{lines} lines of text" if lines > 1 else "a header" if lines else "only blank or comment lines"
+    )
+    return ValueError(
+        f"{path}: line 2 on should hold rows of numbers, but the file has {content} and no data; record it "
+        "again or remove it"
+    )
 
 
 def is_number(field: str, decimal: str) -> bool:
@@ -543,13 +550,7 @@ def _first_row(
     data = [i for i in range(header + 1, len(rows)) if numbers[i]]
     if not data:
         text = sum(bool(row) and not remark for row, remark in zip(rows, comment, strict=True))
-        content = (
-            f"{text} lines of text" if text > 1 else "a header" if text else "only blank or comment lines"
-        )
-        raise ValueError(
-            f"{path}: line 2 on should hold rows of numbers, but the file has {content} and no data; "
-            "record it again or remove it"
-        )
+        raise _without_rows(path, text)
     widths = collections.Counter(len(rows[i]) for i in data)
     width = max(widths, key=lambda count: (widths[count], count))
     table = [i for i in data if len(rows[i]) == width]

@@ -401,6 +401,23 @@ def time_column(path: Path, names: Sequence[str], time: str) -> str:
     return min(ranked)[1]
 
 
+def clock_name(path: Path, columns: Sequence[FileColumn], time: str) -> str:
+    """The column `time`, or the one that is likely to be the time. Raises ValueError with the names that
+    there are."""
+    stamps = [column.name for column in columns if column.type == "time"]
+    if time or not stamps:
+        return time_column(path, [column.name for column in columns], time)
+    # beside dates a temperature or a counter is no time
+    called = [
+        column.name
+        for column in columns
+        if column.type in ("time", "number")
+        and is_time_name(column.name)
+        and column.name not in ("T", *INDEX_NAMES)
+    ]
+    return time_column(path, called, "") if called else stamps[0]
+
+
 def column_place(path: Path, names: Sequence[str], name: str) -> int:
     if name not in names:
         raise ValueError(
@@ -619,24 +636,14 @@ def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> t
     elif table.time is not None and not time:
         clock, zone = table.time, table.zone
     else:
-        clock, zone = _clock(path, table, names, time, notes)
+        clock, zone = _clock(path, table, time, notes)
     values = {name: table.values[name] for name in wanted}
     return forward(FileColumns("rows", clock, values, table.place, zone, table.units), notes), notes
 
 
-def _clock(
-    path: Path, table: WholeTable, names: Sequence[str], time: str, notes: list[Note]
-) -> tuple[np.ndarray, str]:
+def _clock(path: Path, table: WholeTable, time: str, notes: list[Note]) -> tuple[np.ndarray, str]:
     """(time, zone) of the column that `time` names, or of the first with the name of a time."""
-    if not time and table.stamps:
-        # beside dates a temperature or a counter is no time
-        called = [
-            name
-            for name in (*table.stamps, *table.values)
-            if is_time_name(name) and name not in ("T", *INDEX_NAMES)
-        ]
-        time = time_column(path, called, "") if called else next(iter(table.stamps))
-    name = time_column(path, names, time)
+    name = clock_name(path, table.columns(), time)
     if name in table.stamps:
         return table.stamps[name], ""
     if name not in table.values:

@@ -14,12 +14,11 @@ from pipeline.recordings.formats import (
     FileColumn,
     FileColumns,
     Note,
+    clock_name,
     clock_seconds,
     column_places,
     every,
     forward,
-    is_time_name,
-    time_column,
 )
 from pipeline.recordings.instants import instants
 
@@ -109,14 +108,7 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[FileColu
     names = [column.name for column in columns]
     units = {column.name: column.unit for column in columns}
     interval = every(time)
-    clock = ""
-    if not interval:
-        stamps = [column.name for column in columns if column.type == "time"]
-        clock = (
-            stamps[0]
-            if not time and stamps and all(not is_time_name(name) or name == "T" for name in names)
-            else time_column(path, names, time)
-        )
+    clock = "" if interval else clock_name(path, columns, time)
     for name, place in zip(wanted, column_places(path, names, wanted), strict=True):
         column = columns[place]
         if column.type != "number" and not _is_text(types[name]):
