@@ -801,7 +801,7 @@ def _log_times(
 ) -> np.ndarray:
     """ns (n,) since 1970 on the panel's clock."""
     if _DAYS not in fields:
-        return instants(path, _TEXT, fields[_TEXT], lines, month_first=None).ns
+        return instants(path, _TEXT, fields[_TEXT], lines, month_first=None)[0]
     days = floats(path, _DAYS, list(fields[_DAYS]), layout.decimal, lines, {})
     usable = (days > 0) & (days < _LAST_DAY * 1e6)
     if not usable.all():

@@ -94,18 +94,18 @@ def load_klippy(path: Path) -> WholeTable:
     heaters = heater_configs(log.config)
     time, order, notes = _on_calendar(np.frombuffer(log.times), log.sessions, values)
     lines = np.frombuffer(log.lines, np.int64)[order]
-    printed = _print_signals(path, log, time, order)
+    printed, print_notes, _ = _print_signals(path, log, time, order)
     limits = {}
     for heater in heaters:
         limits[f"{heater.heater}.temp"] = (heater.low_degC, heater.high_degC)
         limits[f"{heater.heater}.pwm"] = (0.0, heater.most_percent)
     return WholeTable(
-        {name: column[order] for name, column in values.items()} | printed.values,
+        {name: column[order] for name, column in values.items()} | printed,
         {name: _KEYS[name.rpartition(".")[2].encode()][1] for name in values} | printed_gcode.UNITS,
         time,
         "UTC" if time.dtype == np.int64 else "",
         lambda i: f"line {lines[i]}",
-        [*log.notes(), *notes, *printed.notes, *map(_control_note, heaters)],
+        [*log.notes(), *notes, *print_notes, *map(_control_note, heaters)],
         {name: limits[name] for name in values if name in limits},
         {},
         {},
@@ -116,7 +116,7 @@ def printed_files(path: Path) -> list[Path]:
     """The G-code files and histories beside a klippy.log that its fan and feed are from."""
     log = _read(path)
     time, order, _ = _on_calendar(np.frombuffer(log.times), log.sessions, {})
-    return _print_signals(path, log, time, order).files if log.times else []
+    return _print_signals(path, log, time, order)[2] if log.times else []
 
 
 def printer_heaters(path: Path) -> list[HeaterConfig]:

@@ -600,10 +600,10 @@ def _check_time(
         first = month_first({stamp.split()[0] for stamp in plain}, plain[0])
         try:
             # CAXTON writes a fraction of a second behind a hyphen, 13:12:50-34
-            clock = instants(
+            ns, _, _ = instants(
                 path, "timestamp", plain, lines[present].tolist(), month_first=first, hyphen_fraction=True
             )
-            times = clock.ns.astype(float) / 1e9
+            times = ns.astype(float) / 1e9
         except ValueError as error:
             raise ValueError(str(error).replace("name another column", "remove that column")) from None
     which, lines, names = which[present], lines[present], list(itertools.compress(prints, present))

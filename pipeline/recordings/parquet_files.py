@@ -221,4 +221,4 @@ def _iso_ns(path: Path, name: str, column: pa.ChunkedArray) -> np.ndarray:
     texts = column.to_pylist()
     if missing := texts.count(None):
         raise ValueError(f"{path}: time {name} is missing in {missing} rows; remove them")
-    return instants(path, name, texts, range(1, len(texts) + 1), month_first=None).ns
+    return instants(path, name, texts, range(1, len(texts) + 1), month_first=None)[0]

@@ -340,12 +340,8 @@ def _choose(
 # ---- signals
 
 
-class PrintSignals(NamedTuple):
-    """Part fan and feed (n,) by name, none if no print has its file; the files that they are from."""
-
-    values: dict[str, np.ndarray]
-    notes: list[Note]
-    files: list[Path]
+# part fan and feed (n,) by name, none if no print has its file; notes; and the files that they are from
+PrintSignals = tuple[dict[str, np.ndarray], list[Note], list[Path]]
 
 
 def print_signals(
@@ -360,13 +356,13 @@ def print_signals(
             f"{FAN} and {FEED} are not recorded: the log has no sd_pos, the place in a printed file; print "
             "from Klipper's virtual SD card (Mainsail, Fluidd), as a file that OctoPrint streams has none"
         )
-        return PrintSignals({}, [_note(NOT_RECORDED, 1, message)], [])
+        return {}, [_note(NOT_RECORDED, 1, message)], []
     places = {i: np.flatnonzero(rows.print_index == i) for i in indices}
     files, jobs, histories = _files_of(log, rows, prints, places, start_s, notes)
     contents = _contents(files, rows, prints, places, macros, notes)
     files = {i: path for i, path in files.items() if path in contents}
     if not files:
-        return PrintSignals({}, notes, [])
+        return {}, notes, []
     filament, fan = _on_rows(rows, prints, places, files, contents)
     for i, job in jobs.items():
         if i in files and prints[i].start == 0:
@@ -376,7 +372,7 @@ def print_signals(
     used = list(dict.fromkeys(files.values()))
     message = f"{FAN} and {FEED} are those of {', '.join(path.name for path in used[:6])} in {len(files)} of "
     notes.append(_note(LEFT_OUT, len(files), message + f"{len(indices)} prints"))
-    return PrintSignals({FAN: fan, FEED: filament}, notes, used + histories)
+    return {FAN: fan, FEED: filament}, notes, used + histories
 
 
 def _files_of(log, rows: PrintRows, prints: Sequence[Print], places, start_s: float, notes: list[Note]):

@@ -112,8 +112,8 @@ def load_serial_log(path: Path) -> WholeTable:
             f"{path}: expected lines such as 2025-11-21 13:00:00,500 - Recv: ok T:200.1 /200.0 B:60.0 /60.0, "
             f"found {untimed} reports without a time; write the log with times (OctoPrint's serial.log)"
         )
-    times = instants(path, "of the log", stamps, numbers, month_first=None)
-    ns, midnights = (times.ns, 0) if times.dated else over_midnight(times.ns)
+    ns, _, dated = instants(path, "of the log", stamps, numbers, month_first=None)
+    ns, midnights = (ns, 0) if dated else over_midnight(ns)
     keep = np.r_[True, np.diff(ns) > 0]
     repeated = int((~keep).sum())
     counted = (
