@@ -57,8 +57,6 @@ _ROS = {
     "foxglove_msgs/RawImage": "sec:I nsec:I frame_id:s width:I height:I encoding:s step:I data:b",
     "foxglove_msgs/CompressedImage": "sec:I nsec:I frame_id:s data:b format:s",
 }
-# a picture of that many is 256 MB of 16 bits; the largest of cameras have some 1.5e8
-MOST_PIXELS = 1 << 27
 _FOXGLOVE = ("foxglove/RawImage", "foxglove/CompressedImage")
 READABLE = (
     "sensor_msgs Image and CompressedImage (ROS 2, ROS 1), "
@@ -259,32 +257,9 @@ def _rows(picture: ImageMessage, size: int) -> np.ndarray:
     return np.frombuffer(picture.data, np.uint8, step * picture.height).reshape(picture.height, step)[:, :row]
 
 
-def _size(data: bytes) -> tuple[int, int]:
-    """Height and width by the header of a PNG or JPEG; (0, 0) if they do not stand in `data`."""
-    if data.startswith(b"\x89PNG") and len(data) >= 24:
-        width, height = struct.unpack_from(">II", data, 16)
-        return height, width
-    pos = 2
-    while data.startswith(b"\xff\xd8") and pos + 9 <= len(data) and data[pos] == 0xFF:
-        if data[pos + 1] == 0xFF:  # a filling byte
-            pos += 1
-            continue
-        # SOF0 to SOF15 without DHT, JPG and DAC, which stand among them
-        if 0xC0 <= data[pos + 1] <= 0xCF and data[pos + 1] not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack_from(">HH", data, pos + 5)
-            return height, width
-        pos += 2 + struct.unpack_from(">H", data, pos + 2)[0]
-    return 0, 0
-
-
 def _decode_picture(data: bytes | memoryview, flags: int) -> np.ndarray | None:
-    """The gray picture of encoded bytes, None if there is none. Raises UnreadableMessage."""
-    height, width = _size(bytes(data[: 1 << 16]))
-    if height * width > MOST_PIXELS:
-        # they would take the memory before the first of them is read
-        raise UnreadableMessage(
-            f"its header says {width} x {height} px; pictures of up to {MOST_PIXELS} px are read"
-        )
+    """The gray picture of encoded bytes, None if there is none. OpenCV refuses one whose header says more
+    than OPENCV_IO_MAX_IMAGE_PIXELS, before it takes memory for them."""
     # without ANYDEPTH 16 bits would be cut down to 8
     flags |= cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
     with contextlib.suppress(cv2.error):

@@ -138,10 +138,6 @@ def _check_sources(path: Path, sources: Sequence[Source]) -> None:
             f"{path}: the mapping names no signal; map each input and output to a column or topic (beadline "
             "inspect proposes a mapping)"
         )
-    signals = [source.signal for source in sources]
-    twice = sorted({signal for signal in signals if signals.count(signal) > 1})
-    if twice:
-        raise ValueError(f"{path}: the mapping gives {twice[0]} more than one source; give it one")
     for source in sources:
         if not (np.isfinite(source.scale) and np.isfinite(source.offset) and source.scale != 0):
             raise ValueError(

@@ -340,7 +340,6 @@ def test_a_folder_and_a_missing_file_are_refused(tmp_path):
 def test_mappings_that_make_no_sense_are_refused(tmp_path):
     for sources, sentence in (
         ([], "the mapping names no signal"),
-        ([SOURCES[0], SOURCES[0]], "gives u more than one source"),
         ([Source("u", "u", "percent", 0.0)], "has scale 0 and offset 0; both must be finite, scale not 0"),
     ):
         assert sentence in refusal(tmp_path, "t,u,y\n0,1,2\n", sources)
