@@ -66,15 +66,6 @@ LONGEST_CHUNK = 10
 # (seconds, nanoseconds) as the fields of a time stamp are called in ROS 2, Foxglove JSON, ROS 1 and protobuf
 _STAMPS = (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "nanos"))
 LARGEST_METADATA = 1 << 20
-# between the parts of one bag
-LONGEST_PAUSE_S = 60.0
-# how text-mode copying changes the magic
-_CONVERSIONS = {
-    b"\x89MCAP0\n": "CR LF to LF",
-    b"\x89MCAP0\r\r\n": "LF to CR LF",
-    b"\x89MCAP0\r\x0b": "CR LF",
-    b"\x89MCAP0\r": "CR LF to CR",
-}
 # the length of a record that has always the same
 _LENGTHS = {Opcode.FOOTER: 20, Opcode.DATA_END: 4}
 ENDS = "the file ends in it"
@@ -117,22 +108,13 @@ class Messages(NamedTuple):
 
 
 def check_magic(path: Path, start: bytes) -> None:
-    """Raises ValueError if the first 8 bytes are not MCAP's. The message names a conversion by text-mode
-    copying."""
-    if start[:8] == MAGIC:
-        return
-    expected, actual = MAGIC.hex(" "), start[:8].hex(" ")
-    how = next((how for damaged, how in _CONVERSIONS.items() if start.startswith(damaged)), "")
-    if how:
+    """Raises ValueError if the first 8 bytes are not MCAP's."""
+    if start[:8] != MAGIC:
         raise ValueError(
-            f"{path}: the bytes at offset 0 should be {expected} but are {actual}: "
-            f"line ends were converted ({how}), which destroys the whole file; "
-            "copy it again as binary (*.mcap binary in .gitattributes)"
+            f"{path}: the bytes at offset 0 should be MCAP's {MAGIC.hex(' ')} but are {start[:8].hex(' ')}; "
+            "copy the recording again as binary: copied as text, with its line ends converted, it is lost "
+            "(*.mcap binary in .gitattributes)"
         )
-    raise ValueError(
-        f"{path}: the bytes at offset 0 should be MCAP's {expected} but are {actual}; "
-        "copy the recording again as binary"
-    )
 
 
 class _Whole(ReadDataStream):
@@ -879,7 +861,7 @@ def read_mcap(
     if missing:
         raise ValueError(f"{path}: no part of the bag holds a message of {missing[0]}; map another topic")
     columns = [join_parts(path, groups) for groups in pieces.values()]
-    return columns, places, dict(counts), notes + _pauses(pieces)
+    return columns, places, dict(counts), notes
 
 
 def _backwards_notes(columns: TopicColumns, counts: dict[str, int]) -> list[Note]:
@@ -984,19 +966,3 @@ def _text(value: object) -> str:
     if not isinstance(value, str):
         raise TypeError("no text")
     return value
-
-
-def _pauses(pieces: dict[str, list[FileColumns]]) -> list[Note]:
-    """A note if parts of a bag stand farther apart than they last: a recorder goes on at once in the next
-    part."""
-    for topic, groups in pieces.items():
-        spans = sorted((group.time[0].item(), group.time[-1].item()) for group in groups)
-        for (first, end), (begin, last) in itertools.pairwise(spans):
-            gap_s, lasting_s = (begin - end) / 1e9, (end - first + last - begin) / 1e9
-            if gap_s > max(LONGEST_PAUSE_S, lasting_s):
-                message = (
-                    f"two parts hold {topic} {gap_s:.0f} s apart, longer than they last: "
-                    "one of them may be of another recording"
-                )
-                return [Note("clock", "", len(spans), message)]
-    return []
