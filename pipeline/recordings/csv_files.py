@@ -471,16 +471,11 @@ def _float(
         return SWITCH[word]
     if re.fullmatch(r"[+-]?(inf|infinity|nan)", word):
         return float(word)
-    remedy = "mend that line, or leave the field empty"
-    if re.fullmatch(r"[+-]?[\d.,]+\s*[^\d\s.,]{1,6}", plain):
-        remedy = "write the numbers without their unit"
-    elif re.fullmatch(r"[+-]?[\d.,\s']+", plain):
-        mark = "a point" if decimal == "." else "a comma"
-        remedy = f"write the numbers without marks between thousands, with {mark} before the decimals"
-        if _AMBIGUOUS.match(plain):
-            fraction, thousand = plain.replace(",", "."), re.sub("[.,]", "", plain)
-            remedy = f"it may be {fraction} or {thousand}: declare ingest.decimal, or {remedy}"
-    raise ValueError(f"{path}: line {line}, column {name} should be a number but is {plain[:40]!r}; {remedy}")
+    raise ValueError(
+        f"{path}: line {line}, column {name} should be a number but is {plain[:40]!r}; write it without unit "
+        f"and marks between thousands, with {'a point' if decimal == '.' else 'a comma'} before decimals, or "
+        "leave the field empty"
+    )
 
 
 # ---- the layout

@@ -162,7 +162,7 @@ class _Log:
         self.config: list[str] = []
         self.in_config = False
         self.idle = self.garbled = self.cut = 0
-        self.first_garbled = self.first_undated = 0
+        self.first_garbled = 0
         self.prints: list[Print] = []
         self.is_printing, self.is_over, self.position, self.opened = False, False, -1, ("", -1)
         # of each row: buffer_time, position in the printed file, index of the print, whether it is being read
@@ -174,9 +174,7 @@ class _Log:
             self._add_stats(line, text)
         elif start := _START.search(text):
             zero_s = float(start[1]) - float(start[2])
-            if not 0 <= zero_s < LATEST_S:
-                self.first_undated, zero_s = self.first_undated or line, np.nan
-            self.sessions.append((len(self.times), zero_s))
+            self.sessions.append((len(self.times), zero_s if 0 <= zero_s < LATEST_S else np.nan))
             self.is_printing, self.position = False, -1
         elif event := _PRINTING.search(text):
             self._add_print_event(line, event)
@@ -289,11 +287,6 @@ class _Log:
                 self.garbled,
                 f"{self.garbled} Stats lines hold text or zero bytes in place of a number, or a count that "
                 f"no computer reaches, and were left out, the first is line {self.first_garbled}",
-            ),
-            (
-                "damage",
-                int(self.first_undated > 0),
-                f"the start in line {self.first_undated} gives no time of day that can be; it is not used",
             ),
             ("truncated", self.cut, f"{self.cut} Stats lines break off and were left out"),
             (

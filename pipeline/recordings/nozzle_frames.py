@@ -213,8 +213,7 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution) -> Noz
                 f"{path} is a link to what is not there; copy the file itself, or remove the link"
             )
     logs = [read_log(path, options.hotend) for path in files[".csv"]]
-    recordings, copies = _different(files[".mcap"])
-    if not (logs or recordings):
+    if not (logs or files[".mcap"]):
         raise ValueError(
             f"{folder}: expected a CSV with its images, or MCAP recordings, found neither; copy them there, "
             "or set the source to simulated"
@@ -229,7 +228,7 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution) -> Noz
         joblib.delayed(read_recording)(
             path.resolve(), path, options.topics, options.tip_px, front_end=options.front_end
         )
-        for path in recordings
+        for path in files[".mcap"]
     ]
     every = [*itertools.chain.from_iterable(calls), *films]
     running = run_all(every, execution, remains=": what was read is kept")
@@ -248,7 +247,7 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution) -> Noz
     parts += results
     read = {name for name in names if name.lower().endswith(tuple(files))}
     unread = names.difference(read, *(images for images, _ in listed))
-    return _join(folder, parts, options, copies + _unread(folder, unread))
+    return _join(folder, parts, options, _unread(folder, unread))
 
 
 def _crops(log: FrameLog, folder: Path, images: list[str], problems: list[str], options: ReadOptions) -> list:
@@ -313,22 +312,6 @@ def pictures(places: Sequence[tuple[Path, int]], topics: Topics) -> list[np.ndar
 
 
 # ---- which images
-
-
-def _different(paths: Sequence[Path]) -> tuple[list[Path], list[Note]]:
-    """The files without those that are another once more: what is learned from twice is
-    trusted twice, and judged by what it was learned from."""
-    first: dict[str, Path] = {}
-    different = [path for path in paths if first.setdefault(sha256(path), path) == path]
-    twice = [path for path in paths if path not in different]
-    return different, [
-        Note(
-            "copies",
-            "",
-            len(twice),
-            f"{twice[0]} is another recording once more, byte for byte, and was left out",
-        )
-    ] if twice else []
 
 
 def _unread(folder: Path, names: Iterable[str]) -> list[Note]:
