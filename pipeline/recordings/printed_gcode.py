@@ -325,9 +325,8 @@ def _choose(
         )
         return None, f"expected one G-code file beside the log that fits, found {names}; {remedy}"
     size = f"{of.end}" if of.end >= 0 else f"at least {int(positions.max())}"
-    counted = f"{len(candidates)} G-code files, none of which fits" if candidates else "no G-code file"
-    problems = [f"{path.name} {misfits[path]}" for path in (named or candidates)]
-    found = problems[0] if len(problems) == 1 else counted
+    problems = [f"{path.name} {misfits[path]}" for path in (named or candidates)[:3]]
+    found = " and ".join(problems) or "no G-code file"
     return None, (
         f"expected {name or 'the printed G-code file'} of {size} bytes, found {found}; put the file that was "
         f"printed beside the log or into {FOLDER}/"

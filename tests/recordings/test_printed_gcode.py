@@ -181,7 +181,7 @@ HISTORY = json.dumps(MACHINE.history()).encode()
         ({"a.gcode": CONTENT.replace(b"\n", b"\r\n")}, SIZE + "a.gcode has "),
         ({"a.gcode": JUNK}, SIZE + "a.gcode has other lines"),
         ({"a.gcode": b""}, SIZE + "a.gcode has 0 bytes"),
-        ({"a.gcode": CUT, "b.g": OTHER}, SIZE + "2 G-code files, none of which fits"),
+        ({"a.gcode": CUT, "b.g": OTHER}, SIZE + "a.gcode has"),
         ({"a.gcode": CUT, "b.g": OTHER, "h.json": HISTORY}, f"found a.gcode has {len(CUT)} bytes"),
         ({"a.gcode": CONTENT, "b.g": CONTENT.replace(b"M107", b"M106")}, "found a.gcode and b.g; leave the"),
     ],
