@@ -11,7 +11,6 @@ import csv
 import functools
 import itertools
 import re
-from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -82,16 +81,16 @@ _PAGES = {
 }
 
 
-def extend(columns: Sequence[array], parts: Sequence[np.ndarray]) -> None:
-    """Appends parts (n,) to columns, which grow in place. (Joining the parts at the end would need twice the
-    memory.)"""
+def extend(columns: Sequence[list[np.ndarray]], parts: Sequence[np.ndarray]) -> None:
+    """Appends a part (n,) to each column."""
     for column, part in zip(columns, parts, strict=True):
-        column.frombytes(np.ascontiguousarray(part, column.typecode).view(np.uint8))
+        column.append(np.ascontiguousarray(part))
 
 
-def as_numpy(columns: Sequence[array]) -> list[np.ndarray]:
-    """The columns (n,), without a copy."""
-    return [np.frombuffer(column, column.typecode) for column in columns]
+def join_columns(columns: list[list[np.ndarray]]) -> list[np.ndarray]:
+    """The columns (n,) of their parts, one after the other: each column's parts are gone before the next is
+    joined, so that memory is that of one column more."""
+    return [np.concatenate(columns.pop(0) or [np.empty(0)]) for _ in range(len(columns))]
 
 
 class Clock(NamedTuple):
@@ -591,7 +590,7 @@ def read_plain(
     if dates in places:
         return None
     read = list(dict.fromkeys([*places, *([] if clock is None else [clock.place])]))
-    parts: list[array] = []
+    parts: list[list[np.ndarray]] = [[] for _ in read]
     broken: list[pa.csv.InvalidRow] = []
     try:
         for batch in _batches(path, layout, read, dates, broken):
@@ -606,13 +605,12 @@ def read_plain(
             ]
             if clock is None and np.isnan(columns).all(axis=0).any():
                 return None  # a blank row is no sample
-            parts = parts or [array(column.dtype.char) for column in columns]
             extend(parts, columns)
-        if broken and parts:
+        if broken and parts[0]:
             notes.append(_last_line_note(path, layout, broken[0]))
     except (_NotPlain, pa.ArrowException, UnicodeError):
         return None
-    return dict(zip(read, as_numpy(parts), strict=True)) if parts else None
+    return dict(zip(read, join_columns(parts), strict=True)) if parts[0] else None
 
 
 def _batches(
@@ -744,7 +742,7 @@ def read_long(path: Path, layout: CsvLayout, wanted: Sequence[str]) -> tuple[lis
     Raises ValueError with the line for text in place of a number or a time.
     """
     at, codes = {name: i for i, name in enumerate(layout.names)}, {name: i for i, name in enumerate(wanted)}
-    columns, notes = [array(code) for code in "qdii"], []
+    columns, notes = [[], [], [], []], []
     events: collections.Counter[str] = collections.Counter()
     invalid: collections.Counter[str] = collections.Counter()
 
@@ -766,8 +764,16 @@ def read_long(path: Path, layout: CsvLayout, wanted: Sequence[str]) -> tuple[lis
             invalid.update(itertools.compress(owners, bad))
             values[bad] = np.nan
         times = _log_times(path, layout, {name: fields[i] for name, i in at.items()}, lines)
-        extend(columns, [times, values, np.array(lines), np.array([codes[owner] for owner in owners])])
-    times, values, lines, owners = as_numpy(columns)
+        extend(
+            columns,
+            [
+                times,
+                values,
+                np.array(lines, np.int32),
+                np.array([codes[owner] for owner in owners], np.int32),
+            ],
+        )
+    times, values, lines, owners = join_columns(columns)
     for name, count in invalid.items():
         message = f"{count} values of {name} are marked as not valid and are missing"
         notes.append(Note("invalid", "", count, message))
@@ -1011,7 +1017,7 @@ def _rows_one_by_one(
     which knows every word and names the line of a fault. A unit beside the numbers goes into `units`, which
     has the names of the columns."""
     is_numeric, texts = clock is not None and bool(clock.decimal), []
-    columns = [array("i"), *(array("d") for _ in range(len(units) + is_numeric))]
+    columns: list[list[np.ndarray]] = [[] for _ in range(1 + len(units) + is_numeric)]
     switches: dict[str, set[str]] = {}
     styles: dict[str, tuple[str, str]] = {}
 
@@ -1032,7 +1038,7 @@ def _rows_one_by_one(
             parts.append(floats(path, clock.name, times, layout.decimal, lines, {}))
         else:
             texts += times
-        extend(columns, [np.array(lines), *parts])
+        extend(columns, [np.array(lines, np.int32), *parts])
     for name, words in switches.items():
         message = f"{name} is written as {' and '.join(sorted(words))}, which were read as 1 and 0"
         notes.append(Note("words", "", 1, message))
@@ -1041,7 +1047,7 @@ def _rows_one_by_one(
             units[name] = unit
             message = f"{name} is written with its unit {unit}, which was left out"
             notes.append(Note("words", "", 1, message))
-    numbers, *values = as_numpy(columns)
+    numbers, *values = join_columns(columns)
     return dict(zip(units, values, strict=False)), numbers, values[-1] if is_numeric else texts
 
 

@@ -15,7 +15,6 @@ import os
 import re
 import struct
 import zlib
-from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, TypeVar
@@ -27,7 +26,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
-from pipeline.recordings.csv_files import as_numpy, extend
+from pipeline.recordings.csv_files import extend, join_columns
 from pipeline.recordings.formats import METADATA, FileColumns, Note, nearest_names, seconds
 from pipeline.recordings.messages import (
     Channel,
@@ -672,7 +671,7 @@ class TopicColumns:
         self.fields: dict[str, list[str]] = {}
         self.clocks: dict[str, list[str]] = {}
         self.decoders: dict[int, Decode] = {}
-        self.parts: dict[int, list[array]] = {}
+        self.parts: dict[int, list[list[np.ndarray]]] = {}
         self.bad: collections.Counter[str] = collections.Counter()  # messages that do not fit their schema
         self.backwards: collections.Counter[str] = collections.Counter()
 
@@ -706,7 +705,7 @@ class TopicColumns:
                 raise ValueError(
                     f"{self.file.path}: topic {topic} cannot be read because {error}; map another topic"
                 ) from None
-            self.parts[number] = [array("q"), *(array("d") for _ in names)]
+            self.parts[number] = [[] for _ in range(1 + len(names))]
         try:
             values, sound = _decode(self.decoders[number], messages.data, len(names) + len(clock))
         except ValueError as error:
@@ -728,7 +727,7 @@ class TopicColumns:
         name, and refused."""
         path, pieces = self.file.path, []
         for number in [number for number in self.parts if self.file.channels[number].topic == topic]:
-            time, *values = as_numpy(self.parts.pop(number))
+            time, *values = join_columns(self.parts.pop(number))
             if len(time):
                 columns = dict(zip(self.fields[topic], values, strict=True))
                 pieces.append(FileColumns(str(number), time, columns, str))

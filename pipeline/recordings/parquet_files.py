@@ -1,6 +1,5 @@
 """Parquet files of other people's programs, read a part at a time."""
 
-from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from pipeline.recordings.csv_files import as_numpy, check_one_signal, extend, naming_columns
+from pipeline.recordings.csv_files import check_one_signal, extend, join_columns, naming_columns
 from pipeline.recordings.formats import (
     FileColumn,
     FileColumns,
@@ -162,7 +161,7 @@ def _values(path: Path, file: pq.ParquetFile, kinds: dict[str, type], clock: str
             table = _flat(file.read_row_group(0, columns, use_threads=False))
             if table.num_rows:
                 return {name: _array(path, name, _one_chunk(table[name]), clock) for name in kinds}
-        parts = [array(np.dtype(kind).char) for kind in kinds.values()]
+        parts: list[list[np.ndarray]] = [[] for _ in kinds]
         for batch in file.iter_batches(ROWS_AT_ONCE, columns=columns, use_threads=False):
             table = _flat(pa.Table.from_batches([batch]))
             extend(parts, [_array(path, name, table[name], clock) for name in kinds])
@@ -173,9 +172,9 @@ def _values(path: Path, file: pq.ParquetFile, kinds: dict[str, type], clock: str
             f"{path}: a column cannot be read ({_first_line(error)}); the file is damaged, "
             "so copy the recording again"
         ) from None
-    if not len(parts[0]):
+    if not any(map(len, parts[0])):
         raise ValueError(f"{path}: the table should have rows but has none; record it again or remove it")
-    return dict(zip(kinds, as_numpy(parts), strict=True))
+    return dict(zip(kinds, join_columns(parts), strict=True))
 
 
 def _one_chunk(column: pa.ChunkedArray) -> pa.ChunkedArray:
