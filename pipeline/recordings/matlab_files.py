@@ -4,6 +4,7 @@ scipy reads them in a child process: it ended by SIGSEGV for 2 of 84 garbled fil
 cells.
 """
 
+import math
 import tempfile
 import zlib
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ import numpy as np
 
 from pipeline.recordings.formats import Note, WholeTable, check_values, check_width, is_time_name, seconds
 from pipeline.recordings.isolated import Budget, isolated
+from pipeline.store import artifacts
 
 # of one file; a print log of a day has 100 MB
 BUDGET = Budget(longest_s=60.0, largest_mb=2000.0)
@@ -28,10 +30,12 @@ def load_matlab(path: Path) -> WholeTable:
     ValueError for a damaged file and for one without two samples of anything.
     """
     with tempfile.TemporaryDirectory() as folder:
-        unpacked = Path(folder) / "parts.npz"
-        names, no_columns = isolated(_unpack, path, unpacked, shown=path, budget=BUDGET)
-        with np.load(unpacked) as parts:
-            arrays = dict(zip(names, parts.values(), strict=True))
+        unpacked = Path(folder) / "numbers"
+        shapes, no_columns = isolated(_unpack, path, unpacked, shown=path, budget=BUDGET)
+        numbers = np.fromfile(unpacked)
+    ends = np.cumsum([math.prod(shape) for shape in shapes.values()], dtype=int)
+    parts = zip(shapes.items(), np.split(numbers, ends)[:-1], strict=True)
+    arrays = {name: part.reshape(shape) for (name, shape), part in parts}
     check_values(path, sum(array.size for array in arrays.values()), 1)
     # the length that most arrays have along their longest side; of equally many the longer
     lengths = [max(array.shape) for array in arrays.values() if array.ndim in (1, 2) and array.size]
@@ -91,8 +95,8 @@ def _own_clock(name: str, clocks: list[str]) -> str:
 # ---- variables, in the child
 
 
-def _unpack(path: Path, unpacked: Path) -> tuple[list[str], dict[str, str]]:
-    """Writes the arrays of a file to `unpacked`: their names, and words on every part that is no array.
+def _unpack(path: Path, unpacked: Path) -> tuple[dict[str, tuple[int, ...]], dict[str, str]]:
+    """Writes the numbers of a file to `unpacked`: {name: shape}, and words on every part that is no array.
     Raises ValueError for a file that cannot be read."""
     # it takes a moment, which only such files cost
     import scipy.io
@@ -111,8 +115,8 @@ def _unpack(path: Path, unpacked: Path) -> tuple[list[str], dict[str, str]]:
                 no_columns[name] = part
             else:
                 arrays[name] = part.astype(float).squeeze()
-    np.savez(unpacked, *arrays.values())
-    return list(arrays), no_columns
+    artifacts.write_bytes(unpacked, b"".join(array.tobytes() for array in arrays.values()))
+    return {name: array.shape for name, array in arrays.items()}, no_columns
 
 
 def _parts(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray | str]]:
