@@ -6,7 +6,7 @@ import contextlib
 import difflib
 import re
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -147,7 +147,7 @@ def convert(path: Path, source: Source, recorded: np.ndarray) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def told_of(path: Path) -> Iterator[None]:
+def told_of(path: Path) -> Generator[None, None, None]:
     """A disk's error at `path` as a sentence."""
     try:
         yield

@@ -128,7 +128,7 @@ def load_serial_log(path: Path) -> WholeTable:
     for name in table:
         if name.endswith(".pwm"):
             table[name] *= 100 / (255 if table[name].max() > 127 else 127)
-    values = {name: column.to_numpy()[keep] for name, column in table.items()}
+    values = {str(name): column.to_numpy()[keep] for name, column in table.items()}
     units = {name: "percent" if name.endswith(".pwm") else "degC" for name in values}
     return WholeTable(values, units, ns[keep], "", lambda i: f"line {lines[i]}", notes, {}, {}, {})
 
