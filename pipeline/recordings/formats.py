@@ -209,6 +209,8 @@ _EPOCHS = (
 )
 # ticks of .NET, 100 ns since the year 1, from 1965 to 2124; in ns since 1970 that would be 1989 to 1991
 _TICKS, _SINCE_YEAR_1_S = (6.2e17, 6.7e17), 62_135_596_800
+# seconds since 1904, as LabVIEW counts, from 2015 to 2040
+_SINCE_1904_S, _LABVIEW = 2_082_844_800, (3.5e9, 4.3e9)
 # days since 1899-12-30 (since 1904 where the column says so) and since the year 0, from 1954 to 2119, and
 # 1970-01-01 in them
 _SERIAL_DAYS = ((20_000, 80_000, 25_569, "spreadsheets"), (713_000, 774_000, 719_529, "MATLAB"))
@@ -491,6 +493,11 @@ def seconds(name: str, numbers: np.ndarray, written: str = "") -> tuple[np.ndarr
                 numbers / per_second - epoch,
                 f"column {name} holds numbers up to {high:.3g} and was taken as an epoch in {unit}",
             )
+    if _LABVIEW[0] < low and high < _LABVIEW[1] and np.median(np.abs(np.diff(finite))) < 3600:
+        return (
+            numbers - _SINCE_1904_S,
+            f"column {name} was taken as seconds since 1904, as LabVIEW counts them",
+        )
     for first, last, epoch, program in _SERIAL_DAYS:
         epoch = 24_107 if "1904" in name and program == "spreadsheets" else epoch
         if (
