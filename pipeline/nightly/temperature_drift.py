@@ -440,7 +440,7 @@ def _say(production: ProductionReference, fit: CauseFit, segments: Segments) -> 
     kind, name = fit.cause.kind, _name(fit, production)
     size, deviation = _size(fit, production, segments)
     late = f"{abs(size):.1f} s {'later' if size > 0 else 'earlier'}"
-    every = fit.cause.channel < 0
+    every = fit.cause.channel < 0 or (kind == "delay" and len(production.plant.inputs) == 1)
     clock = ", or the clock of the outputs is off against that of the inputs" if every else ""
     words = SENTENCES[kind][1].format(name=name, size=size, value=fit.value, late=late, clock=clock)
     kind = "delay" if kind == "late sensor" else kind

@@ -506,6 +506,18 @@ def test_good_shifts_with_coarse_sensors_are_no_dead_sensors(look):
         assert [a for a in look(shift | coarse).drift.alarms if a.kind == SENSOR] == []
 
 
+@pytest.mark.parametrize(("inputs_", "told"), [(1, True), (2, False)])
+def test_of_one_input_a_delay_may_be_the_clock_s(look, inputs_, told):
+    machine = params.load(Plant, "plant")
+    folder, limits = Path("champion/temperature"), params.load(Nightly, "nightly").drift
+    production = temperature_drift.read_reference(folder, machine, limits)
+    assert production is not None
+    production = production._replace(plant=machine.model_copy(update={"inputs": machine.inputs[:inputs_]}))
+    fit = drift.CauseFit(drift.DriftCause("delay", 0), 20.0, 1.0, 900.0)
+    said = temperature_drift._say(production, fit, ())
+    assert said.words.startswith("heater_1 acts ") and ("or the clock of the outputs" in said.words) == told
+
+
 def test_a_night_says_what_it_used_and_what_would_have_shown(look):
     shift = nights.a_night(1, 730)
     silent = np.where((np.arange(600) >= 300) & (np.arange(600) < 320), np.nan, shift["sensor_2"])
