@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.recordings.formats import CALENDAR_S, FileColumns, Note
+from pipeline.recordings.formats import FileColumns, Note
 
 HOUR_S = 3600
 # a clock that runs on for no more than so many samples before it falls back is not one clock
@@ -254,17 +254,6 @@ def _forward_rows(group: FileColumns, notes: list[Note]) -> np.ndarray:
     return order
 
 
-def start_of(first: float, second: float, zones: str, notes: list[Note]) -> float:
-    """The instant from which time is counted: 0, or the first whole second of a calendar, which is noted.
-    `second` is one in the unit of `first`."""
-    if first <= CALENDAR_S * second:
-        return 0
-    zero = np.datetime64(int(first // second), "s")
-    message = f"time is counted from {zero} ({zones}, as the recording's clock says)"
-    notes.append(Note("clock", "", 1, message))
-    return first // second * second
-
-
 # ---- clocks that are refused
 
 
@@ -292,11 +281,11 @@ def check_clock(path: Path, group: FileColumns) -> None:
     times = f", the first of {count}" if count > 1 else ""
     raise ValueError(
         f"{path}: {group.place(i + 1)} {problem}{times}, but time should only run forward; "
-        f"{_remedy(steps / unit, back)}"
+        f"{_remedy(group, steps / unit, back)}"
     )
 
 
-def _remedy(steps_s: np.ndarray, back: np.ndarray) -> str:
+def _remedy(group: FileColumns, steps_s: np.ndarray, back: np.ndarray) -> str:
     """The remedy for a clock that stands still or runs backwards, by the way it does."""
     step = steps_s[back[0]]
     remedies = (
@@ -308,9 +297,11 @@ def _remedy(steps_s: np.ndarray, back: np.ndarray) -> str:
             "record each under a name of its own",
         ),
         (
-            True,
-            "split the recording where its clock was set back; if summer time ended there, write the times "
-            "with their zone or in UTC",
+            len(back) == 1 and abs(step + 3600) <= 3 * np.median(np.abs(steps_s)),
+            "an hour is what the end of summer time takes away: write the times with their zone or in UTC, "
+            "or split the recording there",
         ),
+        (group.name == "rows", "split the recording where its clock was set back"),
+        (True, "sort it with: mcap sort, or split it where its clock was set back"),
     )
     return next(remedy for holds, remedy in remedies if holds)

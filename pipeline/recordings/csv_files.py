@@ -81,16 +81,29 @@ _PAGES = {
 }
 
 
-def extend(columns: Sequence[list[np.ndarray]], parts: Sequence[np.ndarray]) -> None:
-    """Appends a part (n,) to each column."""
-    for column, part in zip(columns, parts, strict=True):
-        column.append(np.ascontiguousarray(part))
+class Growing:
+    """Columns (n,) that grow in place as parts of a file come in. (Joining the parts at the end would need
+    twice the memory.)"""
 
+    def __init__(self, kinds: Sequence[type], expected: int = 0):
+        self.count = 0
+        self._columns = [np.empty(max(expected, 1), kind) for kind in kinds]
 
-def join_columns(columns: list[list[np.ndarray]]) -> list[np.ndarray]:
-    """The columns (n,) of their parts, one after the other: each column's parts are gone before the next is
-    joined, so that memory is that of one column more."""
-    return [np.concatenate(columns.pop(0) or [np.empty(0)]) for _ in range(len(columns))]
+    def append(self, *parts: np.ndarray) -> None:
+        end = self.count + len(parts[0])
+        if end > len(self._columns[0]):
+            self._resize(end + end // 4)
+        for column, part in zip(self._columns, parts, strict=True):
+            column[self.count : end] = part
+        self.count = end
+
+    def _resize(self, size: int) -> None:
+        for column in self._columns:
+            column.resize(size, refcheck=False)
+
+    def finished(self) -> list[np.ndarray]:
+        self._resize(self.count)
+        return self._columns
 
 
 class Clock(NamedTuple):
@@ -187,20 +200,13 @@ def list_layout(path: Path, is_header: Callable[[list[str]], bool]) -> CsvLayout
     written = [i for i, row in enumerate(fields) if any(row) and not remark[i]]
     heads = [i for i, row in enumerate(fields) if is_header(row)] or written
     if not heads or not any(i > heads[0] for i in written):
-        raise _without_rows(path, len(written))
+        content = "a header" if heads else "only blank or comment lines"
+        raise ValueError(
+            f"{path}: line 2 on should hold rows of numbers, but the file has {content} and no data; "
+            "record it again or remove it"
+        )
     names = [field.strip() for field in fields[heads[0]]]
     return layout._replace(names=names, units=[""] * len(names), skip=heads[0] + 1)
-
-
-def _without_rows(path: Path, lines: int) -> ValueError:
-    """The refusal of a file that has so many lines of text alone."""
-    content = (
-        f"{lines} lines of text" if lines > 1 else "a header" if lines else "only blank or comment lines"
-    )
-    return ValueError(
-        f"{path}: line 2 on should hold rows of numbers, but the file has {content} and no data; record it "
-        "again or remove it"
-    )
 
 
 def is_number(field: str, decimal: str) -> bool:
@@ -470,11 +476,16 @@ def _float(
         return SWITCH[word]
     if re.fullmatch(r"[+-]?(inf|infinity|nan)", word):
         return float(word)
-    raise ValueError(
-        f"{path}: line {line}, column {name} should be a number but is {plain[:40]!r}; write it without unit "
-        f"and marks between thousands, with {'a point' if decimal == '.' else 'a comma'} before decimals, or "
-        "leave the field empty"
-    )
+    remedy = "mend that line, or leave the field empty"
+    if re.fullmatch(r"[+-]?[\d.,]+\s*[^\d\s.,]{1,6}", plain):
+        remedy = "write the numbers without their unit"
+    elif re.fullmatch(r"[+-]?[\d.,\s']+", plain):
+        mark = "a point" if decimal == "." else "a comma"
+        remedy = f"write the numbers without marks between thousands, with {mark} before the decimals"
+        if _AMBIGUOUS.match(plain):
+            fraction, thousand = plain.replace(",", "."), re.sub("[.,]", "", plain)
+            remedy = f"it may be {fraction} or {thousand}: declare ingest.decimal, or {remedy}"
+    raise ValueError(f"{path}: line {line}, column {name} should be a number but is {plain[:40]!r}; {remedy}")
 
 
 # ---- the layout
@@ -544,7 +555,13 @@ def _first_row(
     data = [i for i in range(header + 1, len(rows)) if numbers[i]]
     if not data:
         text = sum(bool(row) and not remark for row, remark in zip(rows, comment, strict=True))
-        raise _without_rows(path, text)
+        content = (
+            f"{text} lines of text" if text > 1 else "a header" if text else "only blank or comment lines"
+        )
+        raise ValueError(
+            f"{path}: line 2 on should hold rows of numbers, but the file has {content} and no data; "
+            "record it again or remove it"
+        )
     widths = collections.Counter(len(rows[i]) for i in data)
     width = max(widths, key=lambda count: (widths[count], count))
     table = [i for i in data if len(rows[i]) == width]
@@ -568,6 +585,8 @@ def _first_row(
 # ---- rows of plain numbers by Arrow, which reads only what the slow way reads in the same manner
 
 BLOCK_BYTES = 1 << 20
+# a first block of short rows may promise what is not there
+MOST_EXPECTED = 1 << 22
 # Arrow knows zones up to 24 h; ours end at 14, and some programs write a fraction behind a hyphen
 _FAR_ZONE = r":\d\d(\.\d+)?[+-](1[5-9]|2\d|14:?(0[1-9]|[1-9]\d))"
 _ISO = re.compile(r"\d{4}-\d\d-\d\d(?:[T ]\d\d:\d\d(?::\d\d(?:\.\d{1,9})?)?)?(Z|[+-]\d\d(?::?\d\d)?)?$")
@@ -590,7 +609,7 @@ def read_plain(
     if dates in places:
         return None
     read = list(dict.fromkeys([*places, *([] if clock is None else [clock.place])]))
-    parts: list[list[np.ndarray]] = [[] for _ in read]
+    parts: Growing | None = None
     broken: list[pa.csv.InvalidRow] = []
     try:
         for batch in _batches(path, layout, read, dates, broken):
@@ -605,12 +624,18 @@ def read_plain(
             ]
             if clock is None and np.isnan(columns).all(axis=0).any():
                 return None  # a blank row is no sample
-            extend(parts, columns)
-        if broken and parts[0]:
+            if parts is None:
+                # as many rows as the first block promises, so that growing moves nothing
+                expected = int(len(batch) * max(1.0, 1.02 * path.stat().st_size / BLOCK_BYTES)) + 1
+                parts = Growing([column.dtype.type for column in columns], min(expected, MOST_EXPECTED))
+            parts.append(*columns)
+        if parts is None:
+            return None
+        if broken:
             notes.append(_last_line_note(path, layout, broken[0]))
     except (_NotPlain, pa.ArrowException, UnicodeError):
         return None
-    return dict(zip(read, join_columns(parts), strict=True)) if parts[0] else None
+    return dict(zip(read, parts.finished(), strict=True))
 
 
 def _batches(
@@ -742,7 +767,7 @@ def read_long(path: Path, layout: CsvLayout, wanted: Sequence[str]) -> tuple[lis
     Raises ValueError with the line for text in place of a number or a time.
     """
     at, codes = {name: i for i, name in enumerate(layout.names)}, {name: i for i, name in enumerate(wanted)}
-    columns, notes = [[], [], [], []], []
+    columns, notes = Growing([np.int64, float, np.int32, np.int32]), []
     events: collections.Counter[str] = collections.Counter()
     invalid: collections.Counter[str] = collections.Counter()
 
@@ -764,16 +789,8 @@ def read_long(path: Path, layout: CsvLayout, wanted: Sequence[str]) -> tuple[lis
             invalid.update(itertools.compress(owners, bad))
             values[bad] = np.nan
         times = _log_times(path, layout, {name: fields[i] for name, i in at.items()}, lines)
-        extend(
-            columns,
-            [
-                times,
-                values,
-                np.array(lines, np.int32),
-                np.array([codes[owner] for owner in owners], np.int32),
-            ],
-        )
-    times, values, lines, owners = join_columns(columns)
+        columns.append(times, values, np.array(lines), np.array([codes[owner] for owner in owners]))
+    times, values, lines, owners = columns.finished()
     for name, count in invalid.items():
         message = f"{count} values of {name} are marked as not valid and are missing"
         notes.append(Note("invalid", "", count, message))
@@ -802,7 +819,7 @@ def _log_times(
 ) -> np.ndarray:
     """ns (n,) since 1970 on the panel's clock."""
     if _DAYS not in fields:
-        return instants(path, _TEXT, fields[_TEXT], lines, month_first=None)[0]
+        return instants(path, _TEXT, fields[_TEXT], lines, month_first=None).ns
     days = floats(path, _DAYS, list(fields[_DAYS]), layout.decimal, lines, {})
     usable = (days > 0) & (days < _LAST_DAY * 1e6)
     if not usable.all():
@@ -1017,7 +1034,7 @@ def _rows_one_by_one(
     which knows every word and names the line of a fault. A unit beside the numbers goes into `units`, which
     has the names of the columns."""
     is_numeric, texts = clock is not None and bool(clock.decimal), []
-    columns: list[list[np.ndarray]] = [[] for _ in range(1 + len(units) + is_numeric)]
+    columns = Growing([np.int32, *[float] * (len(units) + is_numeric)])
     switches: dict[str, set[str]] = {}
     styles: dict[str, tuple[str, str]] = {}
 
@@ -1038,7 +1055,7 @@ def _rows_one_by_one(
             parts.append(floats(path, clock.name, times, layout.decimal, lines, {}))
         else:
             texts += times
-        extend(columns, [np.array(lines, np.int32), *parts])
+        columns.append(np.array(lines), *parts)
     for name, words in switches.items():
         message = f"{name} is written as {' and '.join(sorted(words))}, which were read as 1 and 0"
         notes.append(Note("words", "", 1, message))
@@ -1047,7 +1064,7 @@ def _rows_one_by_one(
             units[name] = unit
             message = f"{name} is written with its unit {unit}, which was left out"
             notes.append(Note("words", "", 1, message))
-    numbers, *values = join_columns(columns)
+    numbers, *values = columns.finished()
     return dict(zip(units, values, strict=False)), numbers, values[-1] if is_numeric else texts
 
 

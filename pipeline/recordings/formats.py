@@ -2,11 +2,10 @@
 learners, columns on a clock, which column is the time, and tables that are small enough to be read whole."""
 
 import collections
-import contextlib
 import difflib
 import re
 import zipfile
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -113,48 +112,6 @@ def nearest_names(name: str, names: Iterable[str]) -> str:
     if close:
         return f"the nearest names are {', '.join(close[:5])}"
     return f"it has {', '.join(names[:10])}{' and more' if len(names) > 10 else ''}"
-
-
-def map_sources(
-    what: str, place: str, ours: Iterable[Source], mapping: Mapping[str, tuple[str, str, float, float]]
-) -> dict[str, Source]:
-    """{signal: source} of `ours`, the signals of `what`, from where `mapping` {signal: (source, unit, scale,
-    offset)} at `place` has them. Raises ValueError for a signal that is none of ours, and for another
-    unit."""
-    sources = {source.signal: source for source in ours}
-    for name, mapped in mapping.items():
-        if name not in sources:
-            raise ValueError(f"{place}.mapping.{name} is no signal of {what}; {nearest_names(name, sources)}")
-        if mapped[1] != sources[name].unit:
-            raise ValueError(
-                f"{place}.mapping.{name}.unit is {mapped[1]} but {name} is in {sources[name].unit}; convert "
-                f"with scale and offset, and write unit: {sources[name].unit}"
-            )
-        sources[name] = Source(name, *mapped)
-    return sources
-
-
-def convert(path: Path, source: Source, recorded: np.ndarray) -> np.ndarray:
-    """The recorded values (n,) in the signal's unit. Raises ValueError if all are missing."""
-    if not np.isfinite(recorded).any():
-        raise ValueError(
-            f"{path}: {source.source} should hold numbers for {source.signal} but all of its "
-            f"{len(recorded)} values are missing; map another source"
-        )
-    if (source.scale, source.offset) == (1.0, 0.0):
-        return recorded
-    return recorded * source.scale + source.offset
-
-
-@contextlib.contextmanager
-def told_of(path: Path) -> Generator[None, None, None]:
-    """A disk's error at `path` as a sentence."""
-    try:
-        yield
-    except OSError as error:
-        raise ValueError(
-            f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
-        ) from None
 
 
 # the configuration that a klippy.log begins with after a rollover has some 30 kB
@@ -401,23 +358,6 @@ def time_column(path: Path, names: Sequence[str], time: str) -> str:
     return min(ranked)[1]
 
 
-def clock_name(path: Path, columns: Sequence[FileColumn], time: str) -> str:
-    """The column `time`, or the one that is likely to be the time. Raises ValueError with the names that
-    there are."""
-    stamps = [column.name for column in columns if column.type == "time"]
-    if time or not stamps:
-        return time_column(path, [column.name for column in columns], time)
-    # beside dates a temperature or a counter is no time
-    called = [
-        column.name
-        for column in columns
-        if column.type in ("time", "number")
-        and is_time_name(column.name)
-        and column.name not in ("T", *INDEX_NAMES)
-    ]
-    return time_column(path, called, "") if called else stamps[0]
-
-
 def column_place(path: Path, names: Sequence[str], name: str) -> int:
     if name not in names:
         raise ValueError(
@@ -636,14 +576,24 @@ def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> t
     elif table.time is not None and not time:
         clock, zone = table.time, table.zone
     else:
-        clock, zone = _clock(path, table, time, notes)
+        clock, zone = _clock(path, table, names, time, notes)
     values = {name: table.values[name] for name in wanted}
     return forward(FileColumns("rows", clock, values, table.place, zone, table.units), notes), notes
 
 
-def _clock(path: Path, table: WholeTable, time: str, notes: list[Note]) -> tuple[np.ndarray, str]:
+def _clock(
+    path: Path, table: WholeTable, names: Sequence[str], time: str, notes: list[Note]
+) -> tuple[np.ndarray, str]:
     """(time, zone) of the column that `time` names, or of the first with the name of a time."""
-    name = clock_name(path, table.columns(), time)
+    if not time and table.stamps:
+        # beside dates a temperature or a counter is no time
+        called = [
+            name
+            for name in (*table.stamps, *table.values)
+            if is_time_name(name) and name not in ("T", *INDEX_NAMES)
+        ]
+        time = time_column(path, called, "") if called else next(iter(table.stamps))
+    name = time_column(path, names, time)
     if name in table.stamps:
         return table.stamps[name], ""
     if name not in table.values:

@@ -17,6 +17,7 @@ import binascii
 import contextlib
 import functools
 import heapq
+import math
 import operator
 import os
 import struct
@@ -32,18 +33,17 @@ import orjson
 from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
-from pipeline.recordings.clocks import check_clock, start_of
-from pipeline.recordings.formats import FileColumns, Note, Source, convert, file_format
+from pipeline.recordings.clocks import check_clock
+from pipeline.recordings.formats import CALENDAR_S, FileColumns, Note, Source, file_format
 from pipeline.recordings.mcap_files import (
     CHUNK,
     MESSAGE,
-    MESSAGE_BODY,
+    MESSAGE_HEAD,
     RECORD_HEAD,
     McapFile,
     Topic,
     TopicColumns,
     resolve,
-    split_records,
     topics,
     unpack_chunk,
 )
@@ -57,6 +57,8 @@ _ROS = {
     "foxglove_msgs/RawImage": "sec:I nsec:I frame_id:s width:I height:I encoding:s step:I data:b",
     "foxglove_msgs/CompressedImage": "sec:I nsec:I frame_id:s data:b format:s",
 }
+# a picture of that many is 256 MB of 16 bits; the largest of cameras have some 1.5e8
+MOST_PIXELS = 1 << 27
 _FOXGLOVE = ("foxglove/RawImage", "foxglove/CompressedImage")
 READABLE = (
     "sensor_msgs Image and CompressedImage (ROS 2, ROS 1), "
@@ -257,9 +259,32 @@ def _rows(picture: ImageMessage, size: int) -> np.ndarray:
     return np.frombuffer(picture.data, np.uint8, step * picture.height).reshape(picture.height, step)[:, :row]
 
 
+def _size(data: bytes) -> tuple[int, int]:
+    """Height and width by the header of a PNG or JPEG; (0, 0) if they do not stand in `data`."""
+    if data.startswith(b"\x89PNG") and len(data) >= 24:
+        width, height = struct.unpack_from(">II", data, 16)
+        return height, width
+    pos = 2
+    while data.startswith(b"\xff\xd8") and pos + 9 <= len(data) and data[pos] == 0xFF:
+        if data[pos + 1] == 0xFF:  # a filling byte
+            pos += 1
+            continue
+        # SOF0 to SOF15 without DHT, JPG and DAC, which stand among them
+        if 0xC0 <= data[pos + 1] <= 0xCF and data[pos + 1] not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", data, pos + 5)
+            return height, width
+        pos += 2 + struct.unpack_from(">H", data, pos + 2)[0]
+    return 0, 0
+
+
 def _decode_picture(data: bytes | memoryview, flags: int) -> np.ndarray | None:
-    """The gray picture of encoded bytes, None if there is none. OpenCV refuses one whose header says more
-    than OPENCV_IO_MAX_IMAGE_PIXELS, before it takes memory for them."""
+    """The gray picture of encoded bytes, None if there is none. Raises UnreadableMessage."""
+    height, width = _size(bytes(data[: 1 << 16]))
+    if height * width > MOST_PIXELS:
+        # they would take the memory before the first of them is read
+        raise UnreadableMessage(
+            f"its header says {width} x {height} px; pictures of up to {MOST_PIXELS} px are read"
+        )
     # without ANYDEPTH 16 bits would be cut down to 8
     flags |= cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
     with contextlib.suppress(cv2.error):
@@ -432,8 +457,10 @@ class Frames:
         decoded is left out."""
         for number, (_, picture) in enumerate(self.pictures()):
             if number in numbers:
-                with contextlib.suppress(UnreadableMessage):
+                try:
                     yield number, gray(picture)
+                except UnreadableMessage:
+                    continue
 
     def notes(self) -> list[Note]:
         """What the last walk left out."""
@@ -464,13 +491,15 @@ class Frames:
             stream.seek(offset)
             head = stream.read(9)
             record = stream.read(RECORD_HEAD.unpack(head)[1])
-            content, begin = unpack_chunk(record, check=False) if head[0] == CHUNK else (head + record, 0)
-            for opcode, body in split_records(memoryview(content)[begin:]):
-                if opcode != MESSAGE:
-                    continue
-                channel, _, log_time, publish_time = MESSAGE_BODY.unpack_from(body)
-                if channel == number:
-                    yield log_time, publish_time, body[22:]
+            record_bytes, pos = unpack_chunk(record, check=False) if head[0] == CHUNK else (head + record, 0)
+            content = memoryview(record_bytes)
+            while pos < len(content):
+                length = RECORD_HEAD.unpack_from(content, pos)[1]
+                if content[pos] == MESSAGE:
+                    _, _, channel, _, log_time, publish_time = MESSAGE_HEAD.unpack_from(content, pos)
+                    if channel == number:
+                        yield log_time, publish_time, content[pos + 31 : pos + 9 + length]
+                pos += 9 + length
         except (struct.error, IndexError, UnicodeDecodeError, UnreadableMessage):
             raise ValueError(
                 f"{self.path}: the record at byte {offset} is not what it was a moment ago; "
@@ -582,12 +611,22 @@ def span_of(time_s: np.ndarray) -> tuple[float, float]:
 
 def _values(path: Path, source: Source, recorded: np.ndarray, notes: list[Note]) -> np.ndarray:
     """The recorded values in the signal's unit. A missing value is NaN, and counted."""
-    values, present = convert(path, source, recorded), np.isfinite(recorded)
-    missing = int(np.count_nonzero(~present))
+    missing = int(np.count_nonzero(~np.isfinite(recorded)))
+    if missing == len(recorded):
+        raise ValueError(
+            f"{path}: {source.source} should hold numbers for {source.signal} but all of its {missing} "
+            "values are missing; map another"
+        )
     if missing:
-        message = f"{missing} of {len(recorded)} values of {source.source} are missing"
-        notes.append(Note("missing", source.signal, missing, message))
-    return np.where(present, values, np.nan)
+        notes.append(
+            Note(
+                "missing",
+                source.signal,
+                missing,
+                f"{missing} of {len(recorded)} values of {source.source} are missing",
+            )
+        )
+    return np.where(np.isfinite(recorded), recorded * source.scale + source.offset, np.nan)
 
 
 def _start(path: Path, groups: Sequence[FileColumns], notes: list[Note]) -> int:
@@ -597,7 +636,12 @@ def _start(path: Path, groups: Sequence[FileColumns], notes: list[Note]) -> int:
     """
     for group in groups:
         check_clock(path, group)
-    return int(start_of(min(group.time[0] for group in groups), 10**9, "UTC", notes))
+    first = min(int(group.time[0]) for group in groups)
+    if first <= CALENDAR_S * 1e9:
+        return 0
+    zero = np.datetime64(first // 10**9, "s")
+    notes.append(Note("clock", "", 1, f"time is counted from {zero} (UTC, as the recording's clock says)"))
+    return first // 10**9 * 10**9
 
 
 def damage(path: Path) -> str:
@@ -664,14 +708,18 @@ def _pad(body: bytes) -> bytes:
 def tables_of(
     path: str | Path, time_s: np.ndarray, signals: Sequence[tuple[Source, np.ndarray]]
 ) -> dict[str, dict[str, np.ndarray]]:
-    """{topic: {field: values}}. Raises ValueError for values that are not finite, which no machine can be
-    given, and for times that do not run forward."""
+    """{topic: {field: values}}, checked."""
     time = np.asarray(time_s, float)
     tables: dict[str, dict[str, np.ndarray]] = {}
     for name, values in [
         ("time_s", time),
         *((source.signal, np.asarray(values, float)) for source, values in signals),
     ]:
+        if values.shape != time.shape or time.ndim != 1 or not time.size:
+            raise ValueError(
+                f"{path}: {name} should have one value for each of {time.size} times but has "
+                f"shape {values.shape}"
+            )
         if not np.isfinite(values).all():
             raise ValueError(
                 f"{path}: {name} is not finite at sample {np.flatnonzero(~np.isfinite(values))[0]}; "
@@ -699,9 +747,14 @@ def write_frames(
     """Writes one recording.
 
     `tables` {topic: {field: (T,)}} are those of `tables_of`, `types` {topic: message type}, `pictures`
-    (encoding, frames (time_s, (height, width))), 8 bits for JPEG, else 8 or 16. Frames are taken one by one,
-    so that memory is that of a chunk.
+    (encoding, frames (time_s, (height, width))). Frames are taken one by one, so that memory is that of a
+    chunk. Raises ValueError, with no file written, for an unknown encoding and for frames that
+    `_frame_messages` refuses.
     """
+    if pictures and pictures[0] not in ENCODERS:
+        raise ValueError(
+            f"{path}: the encoding should be jpeg, png or raw but is {pictures[0]!r}; name one of them"
+        )
     with beside(path) as temporary:
         # by its name: only artifacts opens a file to write. Chunks, summary and metadata have a CRC each; one
         # over all of it would be summed twice
@@ -720,7 +773,9 @@ def write_frames(
             if encoding == "raw":
                 name, text, topic = "Image", IMAGE, IMAGE_TOPIC
             channel = _channel(writer, topic, f"sensor_msgs/msg/{name}", text)
-            streams.append(_frame_messages(channel, encoding, frames))
+            streams.append(
+                _frame_messages(path, channel, encoding, frames, span_of(np.asarray(time_s, float)))
+            )
         for sequence, (stamp, channel, message) in enumerate(
             heapq.merge(*streams, key=operator.itemgetter(0))
         ):
@@ -746,15 +801,42 @@ def _signal_messages(
 
 
 def _frame_messages(
-    channel: int, encoding: str, frames: Iterable[tuple[float, np.ndarray]]
+    path, channel: int, encoding: str, frames: Iterable, span: tuple[float, float]
 ) -> Iterator[tuple[int, int, bytes]]:
-    """CDR messages of the frames."""
+    """CDR messages of the frames. Each frame is checked, and at the end the overlap with the signals'
+    time."""
     ending, settings = ENCODERS[encoding]
-    for time, frame in frames:
-        stamp = round(time * 1e9)
+    kind, last, first = None, -1, math.nan
+    for k, (time, frame) in enumerate(frames):
+        stamp = round(time * 1e9) if math.isfinite(time) else -1
+        if stamp <= last:
+            raise ValueError(
+                f"{path}: frame {k} is at {time:g} s but frames should run forward from 0 s or later; "
+                "sort them or shift the time"
+            )
+        if (
+            frame.ndim != 2
+            or frame.dtype not in (np.uint8, np.uint16)
+            or (encoding == "jpeg" and frame.dtype != np.uint8)
+        ):
+            wanted = "uint8" if encoding == "jpeg" else "uint8 or uint16"
+            raise ValueError(
+                f"{path}: frame {k} should be (height, width) of {wanted} but is {frame.shape} of "
+                f"{frame.dtype}; make it gray"
+            )
+        kind = kind or (frame.shape, frame.dtype)
+        if (frame.shape, frame.dtype) != kind:
+            raise ValueError(
+                f"{path}: frame {k} is {frame.shape} of {frame.dtype} but the first is {kind[0]} of "
+                f"{kind[1]}; write one size"
+            )
         head = header(stamp, FRAME_ID)
         if ending:
             message = image_bytes(head, encoding, cv2.imencode(ending, frame, settings)[1])
         else:
             message = image(head, frame)
+        last, first = stamp, time if k == 0 else first
         yield stamp, channel, message
+    if last < 0:
+        raise ValueError(f"{path}: a trial should have frames but there is none; give at least one")
+    check_overlap(path, (first, last / 1e9), {"signals": span})

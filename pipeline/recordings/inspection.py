@@ -23,7 +23,9 @@ from pipeline.recordings.formats import (
     select,
     time_column,
 )
-from pipeline.recordings.mcap_files import Topic, bag_parts, join_parts, merge_topics, survey
+from pipeline.recordings.mcap_files import Topic, bag_parts, survey
+from pipeline.recordings.mcap_files import join_parts as joined
+from pipeline.recordings.mcap_files import merge_topics as merged
 from pipeline.recordings.missing_codes import missing_codes
 from pipeline.recordings.other_formats import LOADERS
 from pipeline.recordings.parquet_files import parquet_columns, read_parquet
@@ -210,20 +212,20 @@ def _unit_note(clock: str, group: FileColumns) -> list[Note]:
 def _mcap(path: Path) -> _Content:
     """Words, columns, units and notes of an MCAP file or a bag, in one walk."""
     surveys = [survey(part, MOST_FIELDS) for part in (bag_parts(path) if path.is_dir() else [path])]
-    by_name = merge_topics([topics for topics, _, _ in surveys])
+    by_name = merged([part.topics for part in surveys])
     lines, groups, units = [f"{len(by_name)} topics"], [], {}
-    notes = list(dict.fromkeys(note for _, _, notes in surveys for note in notes))
+    notes = list(dict.fromkeys(note for part in surveys for note in part.notes))
     bare = collections.Counter(field for topic in by_name.values() for field in topic.fields)
     for topic in by_name.values():
         lines.append(f"  {topic.name}: {_content(topic)}")
         if len(topic.fields) > MOST_FIELDS:
             message = f"{topic.name} has {len(topic.fields)} numbers; the first {MOST_FIELDS} are shown"
             notes.append(Note("fields", "", len(topic.fields), message))
-        columns = [group for _, columns, _ in surveys for group in columns if group.name == topic.name]
+        columns = [group for part in surveys for group in part.columns if group.name == topic.name]
         if not columns:
             continue
         alone = all(bare[field] == 1 for field in topic.fields) and not has_bare_field(topic.fields)
-        groups.append((join_parts(path, columns), "" if alone else f"{topic.name}:"))
+        groups.append((joined(path, columns), "" if alone else f"{topic.name}:"))
         for channel in topic.channels:
             metadata = channel.metadata.items()
             units |= {key.removesuffix(".unit"): unit for key, unit in metadata if key.endswith(".unit")}

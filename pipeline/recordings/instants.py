@@ -10,6 +10,7 @@ import re
 import zoneinfo
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,9 +45,12 @@ _ZONE_HOURS = {
 EXPECTED = "seconds or ISO 8601 such as 2025-11-21T13:00:00.5"
 
 
-# ns (n,) since 1970, or since midnight for text without a date; whether every time names its zone; whether
-# there are dates
-Instants = tuple[np.ndarray, bool, bool]
+class Instants(NamedTuple):
+    """ns (n,) since 1970, or since midnight for text without a date. `zoned`: every time names its zone."""
+
+    ns: np.ndarray
+    zoned: bool
+    dated: bool
 
 
 def is_compact(text: str) -> bool:
@@ -88,7 +92,7 @@ def instants(
                 "convert it, or name another column"
             ) from None
         zoned = zoned and has_zone
-    return ns, zoned, dated
+    return Instants(ns, zoned, dated)
 
 
 def _instant(field: str, month_first: bool | None, previous: int | None) -> tuple[int, bool, bool]:

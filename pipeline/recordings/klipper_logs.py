@@ -51,25 +51,36 @@ _KEYS = {
 _QUEUE = (b"print_time", b"buffer_time", b"sd_pos")
 
 
-class HeaterConfig(NamedTuple):
-    """A heater as the printer's configuration has it.
+class PrinterPid(NamedTuple):
+    """The printer's own PID of a heater, u = kp e + ki ∫e dt - kd dy/dt, u in percent of duty and e in °C.
 
-    `gains` are those of the printer's own PID, u = kp e + ki ∫e dt - kd dy/dt, u in percent of duty and e in
-    °C: kp in percent/°C, ki in percent/(°C s), kd in percent s/°C; () for on-off control. The derivative is
-    smoothed over `smooth_s`; u is cut to 0 ... `most_percent`.
+    The derivative is smoothed over `smooth_s`; u is cut to 0 ... `most_percent`.
     """
+
+    heater: str
+    kp_percent_per_degC: float
+    ki_percent_per_degC_s: float
+    kd_percent_s_per_degC: float
+    most_percent: float
+    smooth_s: float
+
+
+class HeaterConfig(NamedTuple):
+    """A heater as the printer's configuration has it; `pid` is None for on-off control."""
 
     heater: str
     control: str
     low_degC: float
     high_degC: float
     most_percent: float
-    gains: tuple[float, ...]
-    smooth_s: float
+    pid: PrinterPid | None
 
 
-# a run of Klipper: its first row, and the system time at the count's zero, NaN if the log lacks it
-_Session = tuple[int, float]
+class _Session(NamedTuple):
+    """A run of Klipper: its first row, and the system time at the count's zero, NaN if the log lacks it."""
+
+    first: int
+    zero_s: float
 
 
 def load_klippy(path: Path) -> WholeTable:
@@ -94,18 +105,18 @@ def load_klippy(path: Path) -> WholeTable:
     heaters = heater_configs(log.config)
     time, order, notes = _on_calendar(np.frombuffer(log.times), log.sessions, values)
     lines = np.frombuffer(log.lines, np.int64)[order]
-    printed, print_notes, _ = _print_signals(path, log, time, order)
+    printed = _print_signals(path, log, time, order)
     limits = {}
     for heater in heaters:
         limits[f"{heater.heater}.temp"] = (heater.low_degC, heater.high_degC)
         limits[f"{heater.heater}.pwm"] = (0.0, heater.most_percent)
     return WholeTable(
-        {name: column[order] for name, column in values.items()} | printed,
+        {name: column[order] for name, column in values.items()} | printed.values,
         {name: _KEYS[name.rpartition(".")[2].encode()][1] for name in values} | printed_gcode.UNITS,
         time,
         "UTC" if time.dtype == np.int64 else "",
         lambda i: f"line {lines[i]}",
-        [*log.notes(), *notes, *print_notes, *map(_control_note, heaters)],
+        [*log.notes(), *notes, *printed.notes, *map(_control_note, heaters)],
         {name: limits[name] for name in values if name in limits},
         {},
         {},
@@ -116,12 +127,16 @@ def printed_files(path: Path) -> list[Path]:
     """The G-code files and histories beside a klippy.log that its fan and feed are from."""
     log = _read(path)
     time, order, _ = _on_calendar(np.frombuffer(log.times), log.sessions, {})
-    return _print_signals(path, log, time, order)[2] if log.times else []
+    return _print_signals(path, log, time, order).files if log.times else []
 
 
 def printer_heaters(path: Path) -> list[HeaterConfig]:
     """The heaters of the last configuration in a klippy.log; none if it has no configuration."""
-    return heater_configs(_read(path).config)
+    log = _Log()
+    with path.open("rb") as stream:
+        for line, text in _lines(stream):
+            log.add_config(line, text)
+    return heater_configs(log.config)
 
 
 def _read(path: Path) -> "_Log":
@@ -158,11 +173,11 @@ class _Log:
 
     def __init__(self) -> None:
         self.times, self.lines, self.columns = array("d"), array("q"), {}
-        self.sessions: list[_Session] = [(0, np.nan)]
+        self.sessions: list[_Session] = [_Session(0, np.nan)]
         self.config: list[str] = []
         self.in_config = False
         self.idle = self.garbled = self.cut = 0
-        self.first_garbled = 0
+        self.first_garbled = self.first_undated = 0
         self.prints: list[Print] = []
         self.is_printing, self.is_over, self.position, self.opened = False, False, -1, ("", -1)
         # of each row: buffer_time, position in the printed file, index of the print, whether it is being read
@@ -174,14 +189,16 @@ class _Log:
             self._add_stats(line, text)
         elif start := _START.search(text):
             zero_s = float(start[1]) - float(start[2])
-            self.sessions.append((len(self.times), zero_s if 0 <= zero_s < LATEST_S else np.nan))
+            if not 0 <= zero_s < LATEST_S:
+                self.first_undated, zero_s = self.first_undated or line, np.nan
+            self.sessions.append(_Session(len(self.times), zero_s))
             self.is_printing, self.position = False, -1
         elif event := _PRINTING.search(text):
             self._add_print_event(line, event)
         else:
-            self._add_config(text)
+            self.add_config(line, text)
 
-    def _add_config(self, text: bytes) -> None:
+    def add_config(self, line: int, text: bytes) -> None:
         """The last configuration in the log counts."""
         stripped = text.strip()
         if stripped == b"===== Config file =====":
@@ -248,8 +265,8 @@ class _Log:
             self._count_garbled(line)
             return
         # a count that falls without a start is another run, pasted behind
-        if self.times and time < self.times[-1] and self.sessions[-1][0] < len(self.times):
-            self.sessions.append((len(self.times), np.nan))
+        if self.times and time < self.times[-1] and self.sessions[-1].first < len(self.times):
+            self.sessions.append(_Session(len(self.times), np.nan))
             self.is_printing, self.position = False, -1
         count = len(self.times)
         for name in row:
@@ -281,21 +298,28 @@ class _Log:
         self.garbled += 1
 
     def notes(self) -> list[Note]:
-        counted = (
-            (
-                "damage",
-                self.garbled,
-                f"{self.garbled} Stats lines hold text or zero bytes in place of a number, or a count that "
-                f"no computer reaches, and were left out, the first is line {self.first_garbled}",
-            ),
-            ("truncated", self.cut, f"{self.cut} Stats lines break off and were left out"),
-            (
-                "idle",
-                self.idle,
-                f"{self.idle} Stats lines have no print_time (no printer was ready) and were left out",
-            ),
-        )
-        return [Note(kind, "", count, message) for kind, count, message in counted if count]
+        notes = []
+        if self.garbled:
+            message = (
+                f"{self.garbled} Stats lines hold text or zero bytes in place of a number, or a count "
+                "that no computer reaches, and were left out"
+            )
+            notes.append(
+                Note("damage", "", self.garbled, f"{message}, the first is line {self.first_garbled}")
+            )
+        if self.first_undated:
+            message = (
+                f"the start in line {self.first_undated} gives no time of day that can be; it is not used"
+            )
+            notes.append(Note("damage", "", 1, message))
+        if self.cut:
+            notes.append(
+                Note("truncated", "", self.cut, f"{self.cut} Stats lines break off and were left out")
+            )
+        if self.idle:
+            message = f"{self.idle} Stats lines have no print_time (no printer was ready) and were left out"
+            notes.append(Note("idle", "", self.idle, message))
+        return notes
 
 
 # ---- sessions and the calendar
@@ -305,8 +329,12 @@ def _on_calendar(
     counts_s: np.ndarray, sessions: list[_Session], values: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, list[Note]]:
     """(time, rows in the order of time, notes): time_ns where a start gives the calendar, else time_s."""
-    starts = [first for first, _ in sessions] + [len(counts_s)]
-    pieces = [(np.arange(a, b), zero_s) for (a, zero_s), b in zip(sessions, starts[1:], strict=True) if b > a]
+    starts = [session.first for session in sessions] + [len(counts_s)]
+    pieces = [
+        (np.arange(a, b), session.zero_s)
+        for session, a, b in zip(sessions, starts[:-1], starts[1:], strict=True)
+        if b > a
+    ]
     zeros = _zeros(pieces, counts_s, values)
     on_calendar = bool(np.isfinite(zeros).any())
     notes: list[Note] = []
@@ -441,12 +469,15 @@ def heater_configs(lines: list[str]) -> list[HeaterConfig]:
 
 
 def _heater(name: str, keys: dict[str, str]) -> HeaterConfig:
-    gains = tuple(_number(keys, key, np.nan) * 100 / PID_BASE for key in ("pid_kp", "pid_ki", "pid_kd"))
+    most = 100 * _number(keys, "max_power", 1.0)
+    gains = [_number(keys, key, np.nan) * 100 / PID_BASE for key in ("pid_kp", "pid_ki", "pid_kd")]
     control = keys.get("control", "")
-    limits = (_number(keys, key, np.nan) for key in ("min_temp", "max_temp"))
-    most, smooth_s = 100 * _number(keys, "max_power", 1.0), _number(keys, "smooth_time", 1.0)
-    is_pid = control.startswith("pid") and np.isfinite(gains).all()
-    return HeaterConfig(name, control, *limits, most, gains if is_pid else (), smooth_s)
+    pid = None
+    if control.startswith("pid") and np.isfinite(gains).all():
+        pid = PrinterPid(name, *gains, most, _number(keys, "smooth_time", 1.0))
+    return HeaterConfig(
+        name, control, _number(keys, "min_temp", np.nan), _number(keys, "max_temp", np.nan), most, pid
+    )
 
 
 def _number(keys: dict[str, str], key: str, default: float) -> float:
@@ -458,8 +489,8 @@ def _number(keys: dict[str, str], key: str, default: float) -> float:
 
 def _control_note(heater: HeaterConfig) -> Note:
     how = f"control {heater.control or 'unknown'}"
-    if heater.gains:
-        kp, ki, kd = (gain * PID_BASE / 100 for gain in heater.gains)
+    if heater.pid:
+        kp, ki, kd = (gain * PID_BASE / 100 for gain in heater.pid[1:4])
         how = f"its own PID (pid_Kp {kp:g}, pid_Ki {ki:g}, pid_Kd {kd:g})"
     message = (
         f"the printer holds {heater.heater} by {how}, within {heater.low_degC:g} to {heater.high_degC:g} °C "

@@ -1,26 +1,48 @@
 """MATLAB files of versions 5 to 7: vectors, matrices and structures of one length as columns.
 
-scipy reads them in a child process: it ended by SIGSEGV for 2 of 84 garbled files, and for deeply nested
-cells.
+Layout: MathWorks, "MAT-File Format", level 5. (scipy.io.loadmat 1.17 ended the child by SIGSEGV for 2 of 84
+garbled files and for deeply nested cells, and read a matrix of negative size. This reader checks every length
+against what is there, and ended no child.)
 """
 
 import math
-import tempfile
+import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
-from pipeline.recordings.formats import Note, WholeTable, check_values, check_width, is_time_name, seconds
-from pipeline.recordings.isolated import Budget, isolated
-from pipeline.store import artifacts
+from pipeline.recordings.formats import (
+    LARGEST_UNPACKED,
+    MOST_VALUES,
+    Note,
+    WholeTable,
+    check_values,
+    check_width,
+    is_time_name,
+    seconds,
+)
 
-# of one file; a print log of a day has 100 MB
-BUDGET = Budget(longest_s=60.0, largest_mb=2000.0)
+_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_MATRIX, _COMPRESSED = 14, 15
+_CELL, _STRUCTURE, _OBJECT, _TEXT, _SPARSE, _NUMBERS = 1, 2, 3, 4, 5, range(6, 16)
+_COMPLEX = 0x0800
+_CLASSES = {_SPARSE: "a sparse matrix", 16: "a function", 17: "an object; save its time and data as vectors"}
+_DEEPEST, MOST_PARTS = 8, 20_000
+# numpy has 64
+_MOST_DIMENSIONS = 32
 
-# what scipy raises for a file that is damaged
-_DAMAGE = (ValueError, TypeError, LookupError, OSError, ArithmeticError, AttributeError, NotImplementedError)
+
+# a variable or a part of one: its name, its numbers, and words on what it is
+_MatlabPart = tuple[str, np.ndarray | None, str]
+# the kind and the data of an element
+_Element = tuple[int, memoryview]
+
+
+class _Broken(ValueError):
+    """The reason why a variable cannot be read."""
 
 
 def load_matlab(path: Path) -> WholeTable:
@@ -29,14 +51,15 @@ def load_matlab(path: Path) -> WholeTable:
     A structure's parts are "log.T1". The clock is the vector with the name of a time, if there is one. Raises
     ValueError for a damaged file and for one without two samples of anything.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        unpacked = Path(folder) / "numbers"
-        shapes, no_columns = isolated(_unpack, path, unpacked, shown=path, budget=BUDGET)
-        numbers = np.fromfile(unpacked)
-    ends = np.cumsum([math.prod(shape) for shape in shapes.values()], dtype=int)
-    parts = zip(shapes.items(), np.split(numbers, ends)[:-1], strict=True)
-    arrays = {name: part.reshape(shape) for (name, shape), part in parts}
-    check_values(path, sum(array.size for array in arrays.values()), 1)
+    arrays, no_columns, count = {}, {}, 0
+    with path.open("rb") as stream:
+        for name, numbers, words in _parts(path, stream):
+            if numbers is None or numbers.size == 1:
+                no_columns[name] = words
+                continue
+            count += numbers.size
+            check_values(path, count, 1)
+            arrays[name] = numbers.squeeze()
     # the length that most arrays have along their longest side; of equally many the longer
     lengths = [max(array.shape) for array in arrays.values() if array.ndim in (1, 2) and array.size]
     length = max(lengths, key=lambda length: (lengths.count(length), length), default=0)
@@ -92,53 +115,137 @@ def _own_clock(name: str, clocks: list[str]) -> str:
     return max(around, key=lambda clock: clock.count("."), default="")
 
 
-# ---- variables, in the child
+# ---- variables
 
 
-def _unpack(path: Path, unpacked: Path) -> tuple[dict[str, tuple[int, ...]], dict[str, str]]:
-    """Writes the numbers of a file to `unpacked`: {name: shape}, and words on every part that is no array.
-    Raises ValueError for a file that cannot be read."""
-    # it takes a moment, which only such files cost
-    import scipy.io
-
-    try:
-        variables = scipy.io.loadmat(path, chars_as_strings=False)
-    except (*_DAMAGE, zlib.error, scipy.io.matlab.MatReadError) as error:
-        raise ValueError(
-            f"{path}: its variables cannot be read ({' '.join(str(error).split())[:200]}); save it again "
-            "with save(..., '-v7'), or copy the recording again"
-        ) from None
-    arrays, no_columns = {}, {}
-    for variable in variables:
-        for name, part in _parts(variable, variables[variable]) if not variable.startswith("__") else ():
-            if isinstance(part, str):
-                no_columns[name] = part
+def _parts(path: Path, stream: BinaryIO) -> Iterator[_MatlabPart]:
+    """The parts of every variable. Raises ValueError with the place of a variable that cannot be read."""
+    size, unpacked, count = path.stat().st_size, 0, 0
+    order = {b"IM": "<", b"MI": ">"}.get(stream.read(128)[126:128], "<")
+    while len(tag := stream.read(8)) == 8:
+        place = stream.tell() - 8
+        kind, length = struct.unpack(order + "II", tag)
+        try:
+            if place + 8 + length > size:
+                raise _Broken(f"it should have {length} bytes but the file ends after {size - place - 8}")
+            if kind == _MATRIX:
+                content = memoryview(stream.read(length))
+            elif kind == _COMPRESSED:
+                content = _unpack(stream.read(length), LARGEST_UNPACKED - unpacked, order)
             else:
-                arrays[name] = part.astype(float).squeeze()
-    artifacts.write_bytes(unpacked, b"".join(array.tobytes() for array in arrays.values()))
-    return {name: array.shape for name, array in arrays.items()}, no_columns
+                stream.seek(length, 1)
+                continue
+            unpacked += len(content)
+            for part in _variable(content, order, "", 0):
+                count += 1
+                if count > MOST_PARTS:
+                    raise _Broken(f"the file has more than {MOST_PARTS} parts")
+                yield part
+        except (_Broken, struct.error, zlib.error) as error:
+            raise ValueError(
+                f"{path}: the variable at byte {place} cannot be read ({error}); save it again with "
+                "save(..., '-v7'), or copy the recording again"
+            ) from None
 
 
-def _parts(name: str, value: np.ndarray) -> Iterator[tuple[str, np.ndarray | str]]:
-    """(name, numbers, or words on what it is) of the parts of a variable. The entries of a cell and of a
-    structure have a name each."""
-    kind = type(value).__name__
-    if kind == "MatlabOpaque":
-        yield name, "an object; save its time and data as vectors"
-    elif kind == "MatlabFunction":
-        yield name, "a function"
-    elif not isinstance(value, np.ndarray):
-        yield name, "a sparse matrix"
-    elif value.dtype.names:
-        for i, entry in enumerate(value.ravel(order="F"), 1):
-            for field in value.dtype.names:
-                yield from _parts(f"{name}{f'_{i}' if value.size > 1 else ''}.{field}", entry[field])
-    elif value.dtype.kind == "O":
-        for i, entry in enumerate(value.ravel(order="F"), 1):
-            yield from _parts(f"{name}_{i}", entry)
-    elif value.dtype.kind == "U":
-        yield name, f"a text of {value.size} characters"
-    elif value.dtype.kind == "c":
-        yield name, "complex numbers"
+def _unpack(packed: bytes, room: int, order: str) -> memoryview:
+    """The matrix in a compressed variable."""
+    unpacker = zlib.decompressobj()
+    content = unpacker.decompress(packed, room + 9)
+    if len(content) > room:
+        raise _Broken(f"the file unpacks to more than {LARGEST_UNPACKED >> 20} MB")
+    if not unpacker.eof:
+        raise _Broken(f"it breaks off after {len(content)} unpacked bytes")
+    kind, data = next(_elements(memoryview(content), order), (0, memoryview(b"")))
+    if kind != _MATRIX:
+        raise _Broken("no matrix is in it")
+    return data
+
+
+def _elements(data: memoryview, order: str) -> Iterator[_Element]:
+    """The elements one behind the other; a short one has its data in its tag."""
+    pos = 0
+    while pos + 8 <= len(data):
+        kind, length = struct.unpack_from(order + "II", data, pos)
+        start = pos + 8
+        if kind >> 16:
+            kind, length, start = kind & 0xFFFF, kind >> 16, pos + 4
+            if length > 4:
+                raise _Broken(f"a short element of {length} bytes")
+        if start + length > len(data):
+            raise _Broken(f"an element of {length} bytes where {len(data) - start} are left")
+        yield kind, data[start : start + length]
+        pos = pos + 8 if start == pos + 4 else start + length + (-length) % 8
+
+
+def _next_numbers(elements: Iterator[_Element], order: str) -> np.ndarray:
+    kind, data = next(elements, (0, memoryview(b"")))
+    if kind not in _KINDS:
+        raise _Broken("an element that should hold numbers holds none")
+    dtype = np.dtype(order + _KINDS[kind])
+    if len(data) % dtype.itemsize:
+        raise _Broken(f"an element of {len(data)} bytes, no multiple of {dtype.itemsize}")
+    return np.frombuffer(data, dtype)
+
+
+def _variable(data: memoryview, order: str, above: str, depth: int) -> Iterator[_MatlabPart]:
+    """The parts of a matrix; `above` is the name of what holds it."""
+    elements = _elements(data, order)
+    flags, dims = _next_numbers(elements, order), _next_numbers(elements, order)
+    _, own = next(elements, (0, b""))
+    name = above or _text(own)
+    if not len(flags) or (dims < 0).any():
+        raise _Broken("its flags or dimensions are none")
+    kind, shape = int(flags[0]) & 0xFF, tuple(int(size) for size in dims)
+    if kind in _NUMBERS:
+        yield _numeric(name, _next_numbers(elements, order), shape, bool(int(flags[0]) & _COMPLEX))
+    elif kind in (_CELL, _STRUCTURE, _OBJECT) and depth < _DEEPEST:
+        yield from _inner(elements, order, name, kind, depth)
+    elif kind == _TEXT:
+        yield name, None, f"a text of {np.prod(shape, dtype=float):.0f} characters"
     else:
-        yield name, f"one number, {float(value.flat[0]):g}" if value.size == 1 else value
+        yield name, None, _CLASSES.get(kind, f"of class {kind}")
+
+
+def _numeric(name: str, numbers: np.ndarray, shape: tuple[int, ...], is_complex: bool) -> _MatlabPart:
+    count = math.prod(shape)
+    if count != len(numbers):
+        raise _Broken(f"{name} should have {count} numbers but has {len(numbers)}")
+    if count > MOST_VALUES:
+        raise _Broken(f"{name} has {count} numbers, more than the {MOST_VALUES} that are read")
+    if len(shape) > _MOST_DIMENSIONS:
+        return name, None, f"an array of {len(shape)} dimensions"
+    if is_complex:
+        return name, None, "complex numbers"
+    words = f"one number, {float(numbers[0]):g}" if count == 1 else f"{count} numbers"
+    return name, numbers.astype(float).reshape(shape, order="F"), words
+
+
+def _inner(
+    elements: Iterator[_Element], order: str, name: str, kind: int, depth: int
+) -> Iterator[_MatlabPart]:
+    """The parts of a cell array or of a structure, whose fields follow each other in every entry."""
+    fields: list[str] = []
+    if kind != _CELL:
+        if kind == _OBJECT:
+            next(elements, None)
+        width = int((_next_numbers(elements, order)[:1].tolist() or [0])[0])
+        kind_of_names, names = next(elements, (0, b""))
+        if width < 1 or not kind_of_names:
+            raise _Broken("its fields have no names")
+        fields = [_text(names[i : i + width]) for i in range(0, len(names), width)]
+        if not fields:
+            return
+    parts = [data for element_kind, data in elements if element_kind == _MATRIX]
+    for i, data in enumerate(parts[:MOST_PARTS]):
+        if kind == _CELL:
+            full = f"{name}_{i + 1}"
+        else:
+            entry = f"_{i // len(fields) + 1}" if len(parts) > len(fields) else ""
+            full = f"{name}{entry}.{fields[i % len(fields)]}"
+        if len(data):
+            yield from _variable(data, order, full, depth + 1)
+
+
+def _text(name: bytes | memoryview) -> str:
+    return bytes(name).split(b"\0")[0].decode("ascii", errors="replace")

@@ -6,7 +6,6 @@ Definitions are parsed by the mcap package. The walk is ours: the package's read
 index gives nothing of a file that was cut off, and both take 4 to 11 us a message, this one 0.5 us.
 """
 
-import collections
 import contextlib
 import io
 import itertools
@@ -17,7 +16,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, TypeVar
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import yaml
@@ -26,7 +25,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
-from pipeline.recordings.csv_files import extend, join_columns
+from pipeline.recordings.csv_files import Growing
 from pipeline.recordings.formats import METADATA, FileColumns, Note, nearest_names, seconds
 from pipeline.recordings.messages import (
     Channel,
@@ -43,7 +42,6 @@ MAGIC = b"\x89MCAP0\r\n"
 CHUNK, MESSAGE = int(Opcode.CHUNK), int(Opcode.MESSAGE)
 RECORD_HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
-MESSAGE_BODY = struct.Struct("<HIQQ")
 CHUNK_HEAD = struct.Struct("<QQQII")
 FOOTER_RECORD = struct.Struct("<BQQQI")
 # (in the lookahead: a wrong start must not hide a right one in the bytes behind it)
@@ -65,6 +63,15 @@ LONGEST_CHUNK = 10
 # (seconds, nanoseconds) as the fields of a time stamp are called in ROS 2, Foxglove JSON, ROS 1 and protobuf
 _STAMPS = (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "nanos"))
 LARGEST_METADATA = 1 << 20
+# between the parts of one bag
+LONGEST_PAUSE_S = 60.0
+# how text-mode copying changes the magic
+_CONVERSIONS = {
+    b"\x89MCAP0\n": "CR LF to LF",
+    b"\x89MCAP0\r\r\n": "LF to CR LF",
+    b"\x89MCAP0\r\x0b": "CR LF",
+    b"\x89MCAP0\r": "CR LF to CR",
+}
 # the length of a record that has always the same
 _LENGTHS = {Opcode.FOOTER: 20, Opcode.DATA_END: 4}
 ENDS = "the file ends in it"
@@ -107,13 +114,22 @@ class Messages(NamedTuple):
 
 
 def check_magic(path: Path, start: bytes) -> None:
-    """Raises ValueError if the first 8 bytes are not MCAP's."""
-    if start[:8] != MAGIC:
+    """Raises ValueError if the first 8 bytes are not MCAP's. The message names a conversion by text-mode
+    copying."""
+    if start[:8] == MAGIC:
+        return
+    expected, actual = MAGIC.hex(" "), start[:8].hex(" ")
+    how = next((how for damaged, how in _CONVERSIONS.items() if start.startswith(damaged)), "")
+    if how:
         raise ValueError(
-            f"{path}: the bytes at offset 0 should be MCAP's {MAGIC.hex(' ')} but are {start[:8].hex(' ')}; "
-            "copy the recording again as binary: copied as text, with its line ends converted, it is lost "
-            "(*.mcap binary in .gitattributes)"
+            f"{path}: the bytes at offset 0 should be {expected} but are {actual}: "
+            f"line ends were converted ({how}), which destroys the whole file; "
+            "copy it again as binary (*.mcap binary in .gitattributes)"
         )
+    raise ValueError(
+        f"{path}: the bytes at offset 0 should be MCAP's {expected} but are {actual}; "
+        "copy the recording again as binary"
+    )
 
 
 class _Whole(ReadDataStream):
@@ -134,10 +150,7 @@ def _parse(kind: Any, body: bytes) -> Any:
         raise UnreadableMessage("the lengths in it do not agree") from None
 
 
-_Data = TypeVar("_Data", bytes, memoryview)
-
-
-def split_records(data: _Data) -> Iterator[tuple[int, _Data]]:
+def _split_records(data: bytes) -> Iterator[tuple[int, bytes]]:
     """(opcode, body) of records one behind the other. Raises UnreadableMessage for a record that runs over
     the end."""
     pos = 0
@@ -276,7 +289,7 @@ class McapFile(_Walk):
 
     def __init__(self, path: Path):
         super().__init__(path)
-        self.counts: collections.Counter[int] = collections.Counter()
+        self.counts: dict[int, int] = {}
         self.chunks = self.unchecked = self.unchunked = self.undeclared = 0  # chunks: the whole ones
         self.damage: dict[int, str] = {}  # {offset: reason}
         self.lost: dict[
@@ -315,7 +328,7 @@ class McapFile(_Walk):
         actual = zlib.crc32(summary + tail[: FOOTER_RECORD.size - 4])
         reason = f"has CRC 0x{actual:08x} instead of 0x{crc:08x}" if crc and actual != crc else ""
         try:
-            for opcode, body in () if reason else split_records(summary):
+            for opcode, body in () if reason else _split_records(summary):
                 self.define(opcode, body)
                 if opcode == Opcode.STATISTICS:
                     statistics = _parse(records.Statistics, body)
@@ -437,7 +450,7 @@ class McapFile(_Walk):
         """Counts the messages; their first and last time, None if there are none."""
         times = []
         for number, messages in batch.items():
-            self.counts[number] += len(messages.log_time)
+            self.counts[number] = self.counts.get(number, 0) + len(messages.log_time)
             self.undeclared += len(messages.log_time) * (number not in self.channels)
             times += [min(messages.log_time), max(messages.log_time)]
         if not times:
@@ -555,11 +568,11 @@ class GrowingMcap(_Walk):
                     self.leave_out(offset, str(error), body, self.offset)
 
     def _messages(self, content: bytes, wanted: Callable[[Channel], bool]) -> Iterator[Message]:
-        for opcode, body in split_records(content):
+        for opcode, body in _split_records(content):
             if opcode != MESSAGE:
                 self.define(opcode, body)
                 continue
-            number, _, log_time, publish_time = MESSAGE_BODY.unpack_from(body)
+            number, _, log_time, publish_time = struct.unpack_from("<HIQQ", body)
             channel = self.channels.get(number)
             if channel is not None and wanted(channel):
                 yield Message(channel, log_time, publish_time, body[22:])
@@ -599,22 +612,22 @@ def topics(path: Path, samples: int = SAMPLES) -> dict[str, Topic]:
 
     Raises ValueError for a file that is no MCAP.
     """
-    file, names, unreadable, counts = McapFile(path), {}, {}, collections.Counter()
+    file, names, unreadable, counts = McapFile(path), {}, {}, {}
 
     def look(number: int, data: Sequence[bytes]) -> None:
-        counts[number] += len(data)
+        counts[number] = counts.get(number, 0) + len(data)
         try:
             paths = dict.fromkeys(fields(file.channels[number], data))
             names[number] = names.get(number, {}) | paths
         except (ValueError, RecursionError) as error:
             unreadable.setdefault(number, str(error))
 
-    for batch in file.batches(lambda channel: counts[channel.id] < samples):
+    for batch in file.batches(lambda channel: counts.get(channel.id, 0) < samples):
         for number, messages in batch.items():
             if messages.data:
-                look(number, messages.data[: samples - counts[number]])
+                look(number, messages.data[: samples - counts.get(number, 0)])
         promised = (file.promised or {}).items()
-        if promised and all(counts[number] >= min(samples, count) for number, count in promised):
+        if promised and all(counts.get(number, 0) >= min(samples, count) for number, count in promised):
             break
     for number in set(file.channels) - set(counts):
         look(number, [])
@@ -671,9 +684,9 @@ class TopicColumns:
         self.fields: dict[str, list[str]] = {}
         self.clocks: dict[str, list[str]] = {}
         self.decoders: dict[int, Decode] = {}
-        self.parts: dict[int, list[list[np.ndarray]]] = {}
-        self.bad: collections.Counter[str] = collections.Counter()  # messages that do not fit their schema
-        self.backwards: collections.Counter[str] = collections.Counter()
+        self.parts: dict[int, Growing] = {}
+        self.bad: dict[str, int] = {}  # messages that do not fit their schema
+        self.backwards: dict[str, int] = {}
 
     def want(self, topic: Topic, names: Sequence[str]) -> None:
         """Takes the fields `names` of a topic from now on, and those that make its clock: none for log_time
@@ -705,7 +718,8 @@ class TopicColumns:
                 raise ValueError(
                     f"{self.file.path}: topic {topic} cannot be read because {error}; map another topic"
                 ) from None
-            self.parts[number] = [[] for _ in range(1 + len(names))]
+            expected = min((self.file.promised or {}).get(number, 0), MOST_EXPECTED)
+            self.parts[number] = Growing([np.int64, *[float] * len(names)], expected)
         try:
             values, sound = _decode(self.decoders[number], messages.data, len(names) + len(clock))
         except ValueError as error:
@@ -718,16 +732,17 @@ class TopicColumns:
             times = published[sound]
         else:
             times = np.array(messages.log_time, np.uint64).astype(np.int64)[sound]
-        extend(self.parts[number], [times, *values[:, : len(names)].T])
-        self.bad[topic] += len(messages.data) - len(times)
-        self.backwards[topic] += int(np.count_nonzero(np.diff(published) < 0))
+        self.parts[number].append(times, *values[:, : len(names)].T)
+        self.bad[topic] = self.bad.get(topic, 0) + len(messages.data) - len(times)
+        back = int(np.count_nonzero(np.diff(published) < 0))
+        self.backwards[topic] = self.backwards.get(topic, 0) + back
 
     def join(self, topic: str, notes: list[Note]) -> FileColumns:
         """The topic's channels one behind the other. Two channels at the same time are two devices under one
         name, and refused."""
         path, pieces = self.file.path, []
         for number in [number for number in self.parts if self.file.channels[number].topic == topic]:
-            time, *values = join_columns(self.parts.pop(number))
+            time, *values = self.parts.pop(number).finished()
             if len(time):
                 columns = dict(zip(self.fields[topic], values, strict=True))
                 pieces.append(FileColumns(str(number), time, columns, str))
@@ -801,124 +816,100 @@ def _decode(decode: Decode, data: list[bytes], width: int) -> tuple[np.ndarray, 
     return np.concatenate(rows), sound
 
 
-def _walk_topics(
-    path: Path,
-    by_name: dict[str, Topic],
-    wanted: dict[str, list[str]],
-    time: str,
-    failures: dict[int, str] | None = None,
-) -> tuple[TopicColumns, dict[str, int], list[Note]]:
-    """The `wanted` fields {topic: fields} of a file in one walk, {topic: count of the messages that were
-    read}, and notes. A channel that cannot be read goes to `failures` with its reason. Raises ValueError for
-    one without them."""
-    file = McapFile(path)
-    columns, counts = TopicColumns(file, time), collections.Counter()
-    for topic, names in wanted.items():
-        columns.want(by_name[topic], names)
-    for batch in file.batches(lambda channel: channel.topic in wanted and channel.id not in (failures or ())):
-        for number, messages in batch.items():
-            try:
-                columns.add(number, messages)
-            except ValueError as error:
-                if failures is None:
-                    raise
-                failures[number] = str(error)
-                columns.parts.pop(number, None)
+def _topic_counts(file: McapFile) -> dict[str, int]:
+    """{topic: count of the messages that were read}."""
+    counts: dict[str, int] = {}
     for number, count in file.counts.items():
-        counts[file.channels[number].topic if number in file.channels else f"channel {number}"] += count
-    return columns, dict(counts), file.notes() + columns.notes()
+        topic = file.channels[number].topic if number in file.channels else f"channel {number}"
+        counts[topic] = counts.get(topic, 0) + count
+    return counts
 
 
-def read_mcap(
+def mcap_columns(
     path: Path, sources: Sequence[str], time: str
 ) -> tuple[list[FileColumns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
     """The columns of each topic that `sources` need, {source: (topic, field)}, {topic: count of its
-    messages}, and notes, of a file or of all parts of a bag one behind the other.
+    messages}, and notes.
 
     The clock is log_time, or publish_time, or a field of each topic such as header.stamp. Raises ValueError
     for a source that is not there, and for a topic without a whole chunk.
     """
-    parts = bag_parts(path) if path.is_dir() else [path]
-    places, by_part = _places(path, parts, sources)
-    pieces: dict[str, list[FileColumns]] = {}
-    counts, notes = collections.Counter(), []
-    for part, by_name in zip(parts, by_part, strict=True):
-        wanted: dict[str, list[str]] = {}
-        for topic, field in places.values():
-            if topic in by_name and (by_name[topic].count or part == path):
-                wanted.setdefault(topic, []).append(field)
-        if not wanted:
-            continue
-        columns, messages, part_notes = _walk_topics(part, by_name, wanted, time)
-        part_notes += _backwards_notes(columns, messages)
-        for topic in wanted:
-            pieces.setdefault(topic, []).append(columns.join(topic, part_notes))
-        prefix = "" if part == path else f"{part.name}: "
-        notes += [note._replace(message=prefix + note.message) for note in part_notes]
-        counts.update(messages)
-    missing = sorted({topic for topic, _ in places.values()} - set(pieces))
-    if missing:
-        raise ValueError(f"{path}: no part of the bag holds a message of {missing[0]}; map another topic")
-    columns = [join_parts(path, groups) for groups in pieces.values()]
-    return columns, places, dict(counts), notes
+    places, by_name = _places(path, sources)
+    file = McapFile(path)
+    columns = TopicColumns(file, time)
+    for topic in dict.fromkeys(topic for topic, _ in places.values()):
+        columns.want(by_name[topic], [field for at, field in places.values() if at == topic])
+    for batch in file.batches(lambda channel: channel.topic in columns.fields):
+        for number, messages in batch.items():
+            columns.add(number, messages)
+    counts, notes = _topic_counts(file), file.notes() + columns.notes()
+    for topic, count in columns.backwards.items():
+        if count > OUT_OF_ORDER * counts[topic]:
+            message = (
+                f"the publish times of {topic} run back {count} times in {counts[topic]} messages: "
+                "two devices with clocks of their own seem to publish it; "
+                "record each under a topic of its own"
+            )
+            notes.append(Note("mixed", "", count, message))
+    return [columns.join(topic, notes) for topic in columns.fields], places, counts, notes
 
 
-def _backwards_notes(columns: TopicColumns, counts: dict[str, int]) -> list[Note]:
-    sentence = (
-        "the publish times of {} run back {} times in {} messages: two devices with clocks of their own seem "
-        "to publish it; record each under a topic of its own"
-    )
-    return [
-        Note("mixed", "", count, sentence.format(topic, count, counts[topic]))
-        for topic, count in columns.backwards.items()
-        if count > OUT_OF_ORDER * counts[topic]
-    ]
-
-
-def _places(
-    path: Path, parts: Sequence[Path], sources: Sequence[str]
-) -> tuple[dict[str, tuple[str, str]], list[dict[str, Topic]]]:
-    """{source: (topic, field)}, and {name: topic} of each part."""
-    by_part = [topics(part) for part in parts]
-    by_name = merge_topics(by_part)
+def _places(path: Path, sources: Sequence[str]) -> tuple[dict[str, tuple[str, str]], dict[str, Topic]]:
+    """{source: (topic, field)}, and {name: topic}."""
+    by_name = topics(path)
     if not any(topic.fields for topic in by_name.values()):
         reasons = [f"{topic.name}: {topic.unreadable}" for topic in by_name.values() if topic.unreadable]
-        notes = [note for part in parts for note in McapFile(part).walk()]
-        reasons += [note.message for note in notes if note.kind in ("damage", "truncated")]
-        reason = "; ".join(reasons[:3]) or "its messages hold text or nothing"
+        notes = [note.message for note in McapFile(path).walk() if note.kind in ("damage", "truncated")]
+        reason = "; ".join([*reasons, *notes][:3]) or "its messages hold text or nothing"
         raise ValueError(
             f"{path}: no topic with numbers could be read ({reason}); record numeric topics, "
             "or copy the recording again"
         )
     try:
-        return {source: resolve(path, source, by_name) for source in sources}, by_part
+        return {source: resolve(path, source, by_name) for source in sources}, by_name
     except ValueError:
         # a key that JSON messages get later than the first ones
-        by_part = [topics(part, MOST_EXPECTED) for part in parts]
-        by_name = merge_topics(by_part)
-        return {source: resolve(path, source, by_name) for source in sources}, by_part
+        by_name = topics(path, MOST_EXPECTED)
+        return {source: resolve(path, source, by_name) for source in sources}, by_name
 
 
-def survey(path: Path, most_fields: int) -> tuple[dict[str, Topic], list[FileColumns], list[Note]]:
-    """Every topic of a file, the first `most_fields` numbers of each on log_time, and notes on damage and on
-    what is unread: one look at the first messages, and one walk.
+class Survey(NamedTuple):
+    """Every topic of a file, the columns of those with numbers, and notes on damage and on what is unread."""
+
+    topics: dict[str, Topic]
+    columns: list[FileColumns]
+    notes: list[Note]
+
+
+def survey(path: Path, most_fields: int) -> Survey:
+    """The topics of a file with the first `most_fields` numbers of each on log_time: one look at the first
+    messages, and one walk.
 
     Raises ValueError for a file that is no MCAP.
     """
-    by_name, failures = topics(path), {}
-    wanted = {topic.name: topic.fields[:most_fields] for topic in by_name.values() if topic.fields}
-    columns, counts, notes = _walk_topics(path, by_name, wanted, "", failures)
-    channels, groups = columns.file.channels, []
+    by_name, file, failures = topics(path), McapFile(path), {}
+    columns = TopicColumns(file, "")
+    for topic in by_name.values():
+        if topic.fields:
+            columns.want(topic, topic.fields[:most_fields])
+    for batch in file.batches(lambda channel: channel.topic in columns.fields and channel.id not in failures):
+        for number, messages in batch.items():
+            try:
+                columns.add(number, messages)
+            except ValueError as error:
+                failures[number] = str(error)
+                columns.parts.pop(number, None)
+    counts, notes, groups = _topic_counts(file), file.notes() + columns.notes(), []
     for number, error in failures.items():
-        name = channels[number].topic
+        name = file.channels[number].topic
         by_name[name] = by_name[name]._replace(unreadable=by_name[name].unreadable or error)
     by_name = {name: topic._replace(count=counts.get(name, 0)) for name, topic in by_name.items()}
-    for topic in dict.fromkeys(channels[number].topic for number in columns.parts):
+    for topic in dict.fromkeys(file.channels[number].topic for number in columns.parts):
         try:
             groups.append(columns.join(topic, notes))
         except ValueError as error:
             notes.append(Note("unreadable", "", by_name[topic].count, str(error)))
-    return by_name, groups, notes
+    return Survey(by_name, groups, notes)
 
 
 # ---- bags: a folder with metadata.yaml and one or several MCAP files, read as one recording
@@ -965,3 +956,49 @@ def _text(value: object) -> str:
     if not isinstance(value, str):
         raise TypeError("no text")
     return value
+
+
+def read_bag(
+    path: Path, sources: Sequence[str], time: str
+) -> tuple[list[FileColumns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
+    """What `mcap_columns` gives, of all parts of a bag one behind the other."""
+    parts = bag_parts(path)
+    by_part = [topics(part) for part in parts]
+    union = merge_topics(by_part)
+    places = {source: resolve(path, source, union) for source in sources}
+    pieces: dict[str, list[FileColumns]] = {}
+    counts: dict[str, int] = {}
+    notes: list[Note] = []
+    for part, names in zip(parts, by_part, strict=True):
+        wanted = [
+            f"{topic}:{field}" for topic, field in places.values() if topic in names and names[topic].count
+        ]
+        if not wanted:
+            continue
+        columns, _, messages, part_notes = mcap_columns(part, wanted, time)
+        notes += [note._replace(message=f"{part.name}: {note.message}") for note in part_notes]
+        for topic, count in messages.items():
+            counts[topic] = counts.get(topic, 0) + count
+        for group in columns:
+            pieces.setdefault(group.name, []).append(group)
+    missing = sorted({topic for topic, _ in places.values()} - set(pieces))
+    if missing:
+        raise ValueError(f"{path}: no part of the bag holds a message of {missing[0]}; map another topic")
+    columns = [join_parts(path, groups) for groups in pieces.values()]
+    return columns, places, counts, notes + _pauses(pieces)
+
+
+def _pauses(pieces: dict[str, list[FileColumns]]) -> list[Note]:
+    """A note if parts of a bag stand farther apart than they last: a recorder goes on at once in the next
+    part."""
+    for topic, groups in pieces.items():
+        spans = sorted((group.time[0].item(), group.time[-1].item()) for group in groups)
+        for (first, end), (begin, last) in itertools.pairwise(spans):
+            gap_s, lasting_s = (begin - end) / 1e9, (end - first + last - begin) / 1e9
+            if gap_s > max(LONGEST_PAUSE_S, lasting_s):
+                message = (
+                    f"two parts hold {topic} {gap_s:.0f} s apart, longer than they last: "
+                    "one of them may be of another recording"
+                )
+                return [Note("clock", "", len(spans), message)]
+    return []

@@ -74,7 +74,7 @@ def fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
     kind = _kind(channel)
     samples = [plain(sample) for sample in samples]
     if kind == "json":
-        return _json_fields(samples)
+        return _json_fields(channel, samples)
     first = samples[0] if samples else None
     if kind == "protobuf":
         return protobuf_fields(message_types(channel.schema), channel.schema_name, first)
@@ -164,14 +164,31 @@ def _document(message: bytes):
             raise UnreadableMessage(f"a message that is no JSON ({error})") from None
 
 
-def _json_fields(samples: Sequence[bytes]) -> list[str]:
-    """Paths of the numbers in the messages."""
+def _json_fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
+    """Paths of the numbers that a JSON schema promises, and of those in the messages."""
     names: dict[str, None] = {}
+    if channel.schema_encoding == "jsonschema" and channel.schema:
+        with contextlib.suppress(UnreadableMessage):  # the messages tell
+            names |= dict.fromkeys(_schema_paths(_document(channel.schema), "", 0))
     for sample in samples:
         names |= dict.fromkeys(_paths(_document(sample)))
         if len(names) > LARGEST_LAYOUT:
             raise ValueError(f"its messages have {len(names)} numbers where {LARGEST_LAYOUT} are read")
     return list(names)
+
+
+def _schema_paths(schema, prefix: str, depth: int) -> Iterator[str]:
+    properties = schema.get("properties") if isinstance(schema, dict) else None
+    if not isinstance(properties, dict) or depth > 6:
+        return
+    for name, inner in properties.items():
+        kind = inner.get("type") if isinstance(inner, dict) else None
+        if kind == "object":
+            yield from _schema_paths(inner, f"{prefix}{name}.", depth + 1)
+        elif kind == "boolean" or {"number", "integer"} & set(
+            map(str, kind if isinstance(kind, list) else [kind])
+        ):
+            yield prefix + name
 
 
 def _paths(value, prefix: str = "", depth: int = 0) -> Iterator[str]:

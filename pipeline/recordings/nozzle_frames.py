@@ -24,7 +24,7 @@ from tqdm import tqdm
 from pipeline.recordings.csv_files import MISSING as NOTHING_WRITTEN
 from pipeline.recordings.csv_files import CsvLayout, floats, list_layout, sound_rows
 from pipeline.recordings.excluded import readable
-from pipeline.recordings.formats import Note, Source, column_place, map_sources, nearest_names
+from pipeline.recordings.formats import Note, Source, column_place, nearest_names
 from pipeline.recordings.images import (
     MISSING,
     UNREADABLE,
@@ -60,8 +60,6 @@ NO_FLOW, NO_TEMPERATURE, NO_PRINT, NO_NAME = (
     "no print is named",
     "no image is named",
 )
-# of a line, the first that holds
-UNKNOWN = (NO_PRINT, NO_TEMPERATURE, NO_FLOW, NO_NAME, MISSING)
 REMEDIES = {
     MISSING: "copy the images below that folder, with the paths that the file gives",
     UNREADABLE: "copy the images again",
@@ -120,8 +118,21 @@ class Topics(NamedTuple):
 
     def sources(self) -> dict[str, Source]:
         """{signal: source}. Raises ValueError for a signal that is none of ours, and for another unit."""
-        ours = [Source(name, name, unit) for name, unit in UNITS.items()]
-        return map_sources("nozzle frames", PLACE, ours, self.mapping)
+        for name, (_, unit, _, _) in self.mapping.items():
+            if name not in UNITS:
+                raise ValueError(
+                    f"{PLACE}.mapping.{name} is no signal of nozzle frames; {nearest_names(name, UNITS)}"
+                )
+            if unit != UNITS[name]:
+                raise ValueError(
+                    f"{PLACE}.mapping.{name}.unit is {unit} but {name} is in {UNITS[name]}; "
+                    "convert with scale and offset, "
+                    f"and write unit: {UNITS[name]}"
+                )
+        return {
+            name: Source(name, *self.mapping.get(name, (name, unit, 1.0, 0.0)))
+            for name, unit in UNITS.items()
+        }
 
 
 class ReadOptions(NamedTuple):
@@ -213,7 +224,8 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution) -> Noz
                 f"{path} is a link to what is not there; copy the file itself, or remove the link"
             )
     logs = [read_log(path, options.hotend) for path in files[".csv"]]
-    if not (logs or files[".mcap"]):
+    recordings, copies = _different(files[".mcap"])
+    if not (logs or recordings):
         raise ValueError(
             f"{folder}: expected a CSV with its images, or MCAP recordings, found neither; copy them there, "
             "or set the source to simulated"
@@ -228,7 +240,7 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution) -> Noz
         joblib.delayed(read_recording)(
             path.resolve(), path, options.topics, options.tip_px, front_end=options.front_end
         )
-        for path in files[".mcap"]
+        for path in recordings
     ]
     every = [*itertools.chain.from_iterable(calls), *films]
     running = run_all(every, execution, remains=": what was read is kept")
@@ -247,7 +259,7 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution) -> Noz
     parts += results
     read = {name for name in names if name.lower().endswith(tuple(files))}
     unread = names.difference(read, *(images for images, _ in listed))
-    return _join(folder, parts, options, _unread(folder, unread))
+    return _join(folder, parts, options, copies + _unread(folder, unread))
 
 
 def _crops(log: FrameLog, folder: Path, images: list[str], problems: list[str], options: ReadOptions) -> list:
@@ -312,6 +324,22 @@ def pictures(places: Sequence[tuple[Path, int]], topics: Topics) -> list[np.ndar
 
 
 # ---- which images
+
+
+def _different(paths: Sequence[Path]) -> tuple[list[Path], list[Note]]:
+    """The files without those that are another once more: what is learned from twice is
+    trusted twice, and judged by what it was learned from."""
+    first: dict[str, Path] = {}
+    different = [path for path in paths if first.setdefault(sha256(path), path) == path]
+    twice = [path for path in paths if path not in different]
+    return different, [
+        Note(
+            "copies",
+            "",
+            len(twice),
+            f"{twice[0]} is another recording once more, byte for byte, and was left out",
+        )
+    ] if twice else []
 
 
 def _unread(folder: Path, names: Iterable[str]) -> list[Note]:
@@ -394,11 +422,18 @@ def _line_problems(logs: Sequence[FrameLog], images: Sequence[list[str]]) -> lis
     first: dict[str, tuple[int, int]] = {}
     reasons = []
     for k, (log, paths) in enumerate(zip(logs, images, strict=True)):
-        known = log.print_id, np.isfinite(log.temperature), np.isfinite(log.flow), log.image, paths
+        unknown = (
+            (NO_FLOW, ~np.isfinite(log.flow)),
+            (NO_TEMPERATURE, ~np.isfinite(log.temperature)),
+            (NO_PRINT, np.array([not name for name in log.print_id], bool)),
+        )
+        problems = [MISSING if not image else "" for image in paths]
         problems = [
-            next((reason for reason, value in zip(UNKNOWN, line, strict=True) if not value), "")
-            for line in zip(*known, strict=True)
+            NO_NAME if not named else reason for named, reason in zip(log.image, problems, strict=True)
         ]
+        for reason, rows in unknown:
+            for i in np.flatnonzero(rows):
+                problems[i] = reason
         for i, image in enumerate(paths):
             if problems[i] == "" and first.setdefault(image, (k, i)) != (k, i):
                 _check_alike(logs[first[image][0]], first[image][1], log, i)
@@ -556,11 +591,14 @@ def _check_numbers(path: Path, lines: np.ndarray, numbers: dict[str, np.ndarray]
     }  # fmt: skip
     for name, (low, high, unit) in bounds.items():
         values = numbers.get(name, np.zeros(0))
-        is_whole = (name != LABELS) | (values == np.rint(values)) | np.isnan(values)
-        wrong = np.flatnonzero((values < low) | (values > high) | ~is_whole)
-        if len(wrong):
-            i = wrong[0]
-            suffix = f", the first of {len(wrong)}" if len(wrong) > 1 else ""
+        wrong = (
+            (values < low)
+            | (values > high)
+            | ((name == LABELS) & (values != np.rint(values)) & np.isfinite(values))
+        )
+        if wrong.any():
+            i = int(np.flatnonzero(wrong)[0])
+            suffix = f", the first of {wrong.sum()}" if wrong.sum() > 1 else ""
             remedy = (
                 "mend it, or remove that column" if name == LABELS else "mend it, or write it in that unit"
             )
@@ -583,10 +621,10 @@ def _check_time(
         first = month_first({stamp.split()[0] for stamp in plain}, plain[0])
         try:
             # CAXTON writes a fraction of a second behind a hyphen, 13:12:50-34
-            ns, _, _ = instants(
+            clock = instants(
                 path, "timestamp", plain, lines[present].tolist(), month_first=first, hyphen_fraction=True
             )
-            times = ns.astype(float) / 1e9
+            times = clock.ns.astype(float) / 1e9
         except ValueError as error:
             raise ValueError(str(error).replace("name another column", "remove that column")) from None
     which, lines, names = which[present], lines[present], list(itertools.compress(prints, present))

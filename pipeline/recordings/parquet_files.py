@@ -8,21 +8,23 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from pipeline.recordings.csv_files import check_one_signal, extend, join_columns, naming_columns
+from pipeline.recordings.csv_files import Growing, check_one_signal, naming_columns
 from pipeline.recordings.formats import (
     FileColumn,
     FileColumns,
     Note,
-    clock_name,
     clock_seconds,
     column_places,
     every,
     forward,
+    is_time_name,
+    time_column,
 )
 from pipeline.recordings.instants import instants
 
 ROWS_AT_ONCE = 50_000
-MOST_IN_ONE_PIECE = 1 << 22
+# an index may promise what is not there
+MOST_EXPECTED, MOST_IN_ONE_PIECE = 1 << 26, 1 << 22
 
 
 def _parquet(path: Path) -> pq.ParquetFile:
@@ -107,7 +109,14 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[FileColu
     names = [column.name for column in columns]
     units = {column.name: column.unit for column in columns}
     interval = every(time)
-    clock = "" if interval else clock_name(path, columns, time)
+    clock = ""
+    if not interval:
+        stamps = [column.name for column in columns if column.type == "time"]
+        clock = (
+            stamps[0]
+            if not time and stamps and all(not is_time_name(name) or name == "T" for name in names)
+            else time_column(path, names, time)
+        )
     for name, place in zip(wanted, column_places(path, names, wanted), strict=True):
         column = columns[place]
         if column.type != "number" and not _is_text(types[name]):
@@ -161,10 +170,10 @@ def _values(path: Path, file: pq.ParquetFile, kinds: dict[str, type], clock: str
             table = _flat(file.read_row_group(0, columns, use_threads=False))
             if table.num_rows:
                 return {name: _array(path, name, _one_chunk(table[name]), clock) for name in kinds}
-        parts: list[list[np.ndarray]] = [[] for _ in kinds]
+        parts = Growing(list(kinds.values()), min(file.metadata.num_rows, MOST_EXPECTED))
         for batch in file.iter_batches(ROWS_AT_ONCE, columns=columns, use_threads=False):
             table = _flat(pa.Table.from_batches([batch]))
-            extend(parts, [_array(path, name, table[name], clock) for name in kinds])
+            parts.append(*(_array(path, name, table[name], clock) for name in kinds))
     except MemoryError:
         raise
     except (OSError, pa.ArrowException) as error:
@@ -172,9 +181,9 @@ def _values(path: Path, file: pq.ParquetFile, kinds: dict[str, type], clock: str
             f"{path}: a column cannot be read ({_first_line(error)}); the file is damaged, "
             "so copy the recording again"
         ) from None
-    if not any(map(len, parts[0])):
+    if not parts.count:
         raise ValueError(f"{path}: the table should have rows but has none; record it again or remove it")
-    return dict(zip(kinds, join_columns(parts), strict=True))
+    return dict(zip(kinds, parts.finished(), strict=True))
 
 
 def _one_chunk(column: pa.ChunkedArray) -> pa.ChunkedArray:
@@ -220,4 +229,4 @@ def _iso_ns(path: Path, name: str, column: pa.ChunkedArray) -> np.ndarray:
     texts = column.to_pylist()
     if missing := texts.count(None):
         raise ValueError(f"{path}: time {name} is missing in {missing} rows; remove them")
-    return instants(path, name, texts, range(1, len(texts) + 1), month_first=None)[0]
+    return instants(path, name, texts, range(1, len(texts) + 1), month_first=None).ns

@@ -1,11 +1,11 @@
 """Part programs in a folder, and the measured prints beside them."""
 
+import csv
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.recordings import recordings
-from pipeline.recordings.csv_files import csv_columns
 from pipeline.recordings.formats import Source, file_format
 from pipeline.recordings.mcap_files import topics
 from pipeline.recordings.parquet_files import parquet_columns
@@ -70,7 +70,7 @@ def read_measured(path: Path, samples: int, sample_time_s: float) -> tuple[np.nd
     after the last row and in gaps longer than five samples; and the command u (samples,) in mm that was
     printed, None if the file does not have it. Time 0 is where the command begins: of a table as it stands,
     of an MCAP recording the first message of the plunger. Raises ValueError naming file and place."""
-    flow, command = _read_recorded(path)
+    flow, command = _rows(path) if path.suffix == ".csv" else _read_recorded(path)
     t, y = flow
     clock = np.arange(samples) * sample_time_s
     right = np.clip(np.searchsorted(t, clock), 1, len(t) - 1)
@@ -85,16 +85,17 @@ def read_measured(path: Path, samples: int, sample_time_s: float) -> tuple[np.nd
 
 
 def _read_recorded(path: Path) -> tuple[Series, Series | None]:
-    """Flow and, where it has one, command of a table or an MCAP recording."""
+    """Flow and, where it has one, command of a Parquet table or an MCAP recording."""
     kind, wanted = file_format(path), [Source(COLUMNS[1], COLUMNS[1], "mm^3/s")]
     if kind == "mcap":
         plunger = topics(path).get(COMMAND_TOPIC.source.partition(":")[0])
         wanted += [COMMAND_TOPIC] if plunger and plunger.count else []
-    elif kind in ("csv", "parquet"):
-        columns = parquet_columns(path) if kind == "parquet" else csv_columns(path)
-        wanted += [Source(COMMAND, COMMAND, "mm")] * any(column.name == COMMAND for column in columns)
+    elif kind == "parquet":
+        wanted += [Source(COMMAND, COMMAND, "mm")] * any(
+            column.name == COMMAND for column in parquet_columns(path)
+        )
     else:
-        raise ValueError(f"{path}: expected a table or an MCAP recording, found {kind}; name it so")
+        raise ValueError(f"{path}: expected a Parquet table or an MCAP recording, found {kind}; name it so")
     raw = recordings.read(path, wanted, time="" if kind == "mcap" else COLUMNS[0])
     if raw.breaks:
         raise ValueError(f"{path}: its clock starts over after {raw.breaks[0]:g} s; keep one print of it")
@@ -110,3 +111,34 @@ def _read_recorded(path: Path) -> tuple[Series, Series | None]:
     if len(flow[0]) < 2:
         raise ValueError(f"{path}: expected at least two samples of {COLUMNS[1]}, found {len(flow[0])}")
     return (flow[0] - start, flow[1]), None if command is None else (command[0] - start, command[1])
+
+
+def _rows(path: Path) -> tuple[Series, Series | None]:
+    """Flow and, where it has one, command of a CSV table."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+    names = tuple(name.strip() for name in rows[0]) if rows else ()
+    if names not in (COLUMNS, (*COLUMNS, COMMAND)):
+        header = ",".join(rows[0]) if rows else "an empty file"
+        raise ValueError(
+            f"{path}: expected the columns {','.join(COLUMNS)} but found {header}; "
+            "write them as the first row"
+        )
+    values = []
+    for number, row in enumerate(rows[1:], 2):
+        try:
+            figures = [float(cell) for cell in row]
+        except ValueError:
+            figures = []
+        if len(figures) != len(names):
+            raise ValueError(
+                f"{path}, row {number}: expected {len(names)} numbers but found {','.join(row)}; mend it "
+                "or leave the row out"
+            )
+        values.append(figures)
+    t, y, *u = np.array(values, float).reshape(-1, len(names)).T
+    if len(t) < 2 or np.any(np.diff(t) <= 0) or not np.isfinite(t).all():
+        raise ValueError(
+            f"{path}: expected at least two rows whose {COLUMNS[0]} rises; sort them, and leave out repeats"
+        )
+    return (t, y), (t, u[0]) if u else None

@@ -7,6 +7,8 @@ of now (buffer_time). The lines before that byte have moved when the planned mot
     E(t + buffer_time(t)) = E of the lines before sd_pos(t)
     feed(t) = (E(t + dt) - E(t)) / dt                            dt: to the next Stats line
 
+A Klipper of 2024 counts characters in sd_pos instead of bytes: it is off where a file is not ASCII.
+
 The fan is that of the last M106 or M107 so far, or of a macro whose text in the configuration has one. It is
 0 when Klipper starts, and after a print as the file left it. Between prints and in a pause the feed is 0.
 
@@ -45,6 +47,7 @@ MOST_POSITIONS, AGREEING_SHARE = 2000, 0.99
 FEWEST_POSITIONS = 10  # so many positions tell a file without its name
 # a job of the history begins within so many s of its print
 SAME_START_S = 10.0
+FILAMENT_TOLERANCE = 0.05
 LONGEST_MOVE_MM = 1e5  # a line that feeds more is damaged
 _COMMAND = re.compile(
     rb"^[ \t]*+(?:N\d++[ \t]*+)?(?:G0*[0-3](?![\d.])[^;\n]*?E[ \t]*([-+]?(?:\d+\.?\d*|\.\d+))"
@@ -89,6 +92,7 @@ class PrintedFile(NamedTuple):
     """What the lines of a file give."""
 
     filament_mm: np.ndarray  # (n,) fed by the lines before each position
+    unscaled_mm: np.ndarray  # (n,) without M221, as Klipper counts filament_used
     fan_positions: np.ndarray  # (m,) byte at which a command for the fan begins
     fan_percent: np.ndarray  # (m,) and what it requests
     remark: str  # what is left out or assumed, "" for nothing
@@ -102,7 +106,7 @@ class _Reading:
 
     def __init__(self, macros: Mapping[str, float]):
         self.macros = macros
-        self.filament = self.origin = 0.0
+        self.filament = self.unscaled = self.origin = 0.0
         self.factor = 1.0
         self.is_absolute_move = self.is_absolute_e = True
         self.is_declared, self.feeds_undeclared = False, False
@@ -119,6 +123,7 @@ class _Reading:
             self.left_out["damaged moves"] += 1
             return
         self.filament += fed
+        self.unscaled += fed / self.factor
 
     def run(self, start: int, command: str, words: bytes) -> None:
         """Any command but a move."""
@@ -182,14 +187,14 @@ def read_file(path: Path, positions: np.ndarray, macros: Mapping[str, float]) ->
     those that set the part fan, in percent. G2 and G3 feed as G1 does; retractions and tools count as they
     are."""
     state = _Reading(macros)
-    filament, k = np.zeros(len(positions)), 0
+    filament, unscaled, k = np.zeros(len(positions)), np.zeros(len(positions)), 0
     wanted = [*positions.tolist(), np.inf]
     with path.open("rb") as stream:
         for offset, block in _blocks(stream):
             for line in _COMMAND.finditer(block):
                 start = offset + line.start()
                 while wanted[k] <= start:
-                    filament[k] = state.filament
+                    filament[k], unscaled[k] = state.filament, state.unscaled
                     k += 1
                 if k == len(positions):
                     break
@@ -202,9 +207,9 @@ def read_file(path: Path, positions: np.ndarray, macros: Mapping[str, float]) ->
                     state.call(start, name.decode().upper())
             if k == len(positions):
                 break
-    filament[k:] = state.filament
+    filament[k:], unscaled[k:] = state.filament, state.unscaled
     fan = np.array(state.fan_positions, np.int64), np.array(state.fan_percent, float)
-    return PrintedFile(filament, *fan, state.remark())
+    return PrintedFile(filament, unscaled, *fan, state.remark())
 
 
 def _plain(command: bytes) -> str:
@@ -325,19 +330,57 @@ def _choose(
         )
         return None, f"expected one G-code file beside the log that fits, found {names}; {remedy}"
     size = f"{of.end}" if of.end >= 0 else f"at least {int(positions.max())}"
-    problems = [f"{path.name} {misfits[path]}" for path in (named or candidates)[:3]]
-    found = " and ".join(problems) or "no G-code file"
+    counted = f"{len(candidates)} G-code files, none of which fits" if candidates else "no G-code file"
+    problems = [f"{path.name} {misfits[path]}" for path in (named or candidates)]
+    found = problems[0] if len(problems) == 1 else counted
     return None, (
         f"expected {name or 'the printed G-code file'} of {size} bytes, found {found}; put the file that was "
         f"printed beside the log or into {FOLDER}/"
     )
 
 
+def _in_bytes(path: Path, positions: np.ndarray) -> np.ndarray:
+    """Positions (n,), ascending, that count characters, in bytes; as they are in a file of ASCII alone. The
+    first beyond the file's end and all after it are one byte beyond it."""
+    found, characters, offset = [], 0, 0
+    wanted = positions.astype(np.int64)
+    with path.open("rb") as stream:
+        while data := stream.read(BLOCK):
+            begins = np.flatnonzero((np.frombuffer(data, np.uint8) & 0xC0) != 0x80)
+            here = wanted[len(found) :] - characters
+            found += (offset + begins[here[here < len(begins)]]).tolist()
+            characters, offset = characters + len(begins), offset + len(data)
+    found += [offset if position == characters else offset + 1 for position in wanted[len(found) :].tolist()]
+    return np.array(found, np.int64)
+
+
+def _counted_in_characters(
+    candidates: Sequence[Path], positions: np.ndarray, where: np.ndarray, prints: list[Print], i: int
+) -> Path | None:
+    """The one file that fits print i at the rows `where` if its positions count characters. Positions and
+    print are then in bytes."""
+    of, own = prints[i], np.unique(np.r_[prints[i].start, positions[where], max(prints[i].end, 0)])
+    fitting = []
+    for path in candidates:
+        moved = dict(zip(own.tolist(), _in_bytes(path, own).tolist(), strict=True))
+        at, end = np.array([moved[int(x)] for x in positions[where]]), moved.get(of.end, -1)
+        if any(old != new for old, new in moved.items()) and not misfit(path, np.unique(at), end, of.size):
+            fitting.append((path, at, of._replace(start=moved[of.start], end=end)))
+    if len(fitting) != 1:
+        return None
+    ((path, positions[where], prints[i]),) = fitting
+    return path
+
+
 # ---- signals
 
 
-# part fan and feed (n,) by name, none if no print has its file; notes; and the files that they are from
-PrintSignals = tuple[dict[str, np.ndarray], list[Note], list[Path]]
+class PrintSignals(NamedTuple):
+    """Part fan and feed (n,) by name, none if no print has its file; the files that they are from."""
+
+    values: dict[str, np.ndarray]
+    notes: list[Note]
+    files: list[Path]
 
 
 def print_signals(
@@ -346,29 +389,35 @@ def print_signals(
     """Part fan and filament feed at the rows of a log; NaN in a print whose file is not known. `start_s` is
     the time of day of the first row, NaN if it is not known."""
     notes: list[Note] = []
+    rows, prints = rows._replace(position=rows.position.copy()), list(prints)
     indices = [int(i) for i in dict.fromkeys(rows.print_index.tolist()) if i >= 0]
     if not indices:
         message = (
             f"{FAN} and {FEED} are not recorded: the log has no sd_pos, the place in a printed file; print "
             "from Klipper's virtual SD card (Mainsail, Fluidd), as a file that OctoPrint streams has none"
         )
-        return {}, [_note(NOT_RECORDED, 1, message)], []
+        return PrintSignals({}, [_note(NOT_RECORDED, 1, message)], [])
     places = {i: np.flatnonzero(rows.print_index == i) for i in indices}
-    files, histories = _files_of(log, rows, prints, places, start_s, notes)
+    files, jobs, histories = _files_of(log, rows, prints, places, start_s, notes)
     contents = _contents(files, rows, prints, places, macros, notes)
     files = {i: path for i, path in files.items() if path in contents}
     if not files:
-        return {}, notes, []
+        return PrintSignals({}, notes, [])
     filament, fan = _on_rows(rows, prints, places, files, contents)
+    for i, job in jobs.items():
+        if i in files and prints[i].start == 0:
+            positions, content = contents[files[i]]
+            printed = content.unscaled_mm[np.searchsorted(positions, rows.position[places[i]].max())]
+            notes += _filament_note(files[i], float(printed), job.get("filament_used"))
     used = list(dict.fromkeys(files.values()))
     message = f"{FAN} and {FEED} are those of {', '.join(path.name for path in used[:6])} in {len(files)} of "
     notes.append(_note(LEFT_OUT, len(files), message + f"{len(indices)} prints"))
-    return {FAN: fan, FEED: filament}, notes, used + histories
+    return PrintSignals({FAN: fan, FEED: filament}, notes, used + histories)
 
 
-def _files_of(log, rows: PrintRows, prints: Sequence[Print], places, start_s: float, notes: list[Note]):
-    """({print: its file}, the histories that were read); a note for each reason why a print
-    has no file."""
+def _files_of(log, rows: PrintRows, prints: list[Print], places, start_s: float, notes: list[Note]):
+    """({print: its file}, {print: its job}, the histories that were read); a note for each reason why a print
+    has no file. Positions that count characters are in bytes after it."""
     beside = companions(log)
     jobs, histories = [], []
     for path in (path for path in beside if path.suffix.lower() == ".json"):
@@ -379,13 +428,14 @@ def _files_of(log, rows: PrintRows, prints: Sequence[Print], places, start_s: fl
             message = f"{path.name} should be Moonraker's history but cannot be read ({error}); save it again"
             notes.append(_note(NOT_RECORDED, 1, message))
     candidates = [path for path in beside if path not in histories and path.suffix.lower() in SUFFIXES]
-    files, reasons = {}, {}
+    files, job_of, reasons = {}, {}, {}
     for i, where in places.items():
         positions = np.unique(rows.position[where])
-        job = _job_of(jobs, start_s + rows.time_s[where[0]])
-        name = job.get("filename", "") or prints[i].name
+        job_of[i] = _job_of(jobs, start_s + rows.time_s[where[0]])
+        name = job_of[i].get("filename", "") or prints[i].name
         try:
             path, reason = _choose(candidates, name, positions, prints[i])
+            path = path or _counted_in_characters(candidates, rows.position, where, prints, i)
         except OSError as error:
             path, reason = None, f"a G-code file cannot be read ({error.strerror}); copy it again"
         if path:
@@ -396,7 +446,7 @@ def _files_of(log, rows: PrintRows, prints: Sequence[Print], places, start_s: fl
         which = f"{len(lines)} of {len(places)} prints, the first from line {lines[0]} on"
         message = f"{FAN} and {FEED} are not recorded in {which}: {reason}"
         notes.append(_note(NOT_RECORDED, len(lines), message))
-    return files, histories
+    return files, job_of, histories
 
 
 def _contents(files, rows: PrintRows, prints, places, macros, notes: list[Note]):
@@ -465,3 +515,14 @@ def _fan_events(content: PrintedFile, start: int, positions, moved_s, before_s: 
     times = np.interp(at[inside], known, np.r_[max(before_s, moved_s[0] - 1.0), moved_s])
     before = [_event(before_s, p) for p in percent[at < start][-1:]]
     return np.vstack([*before, np.column_stack([times, percent[inside]])])
+
+
+def _filament_note(path: Path, printed_mm: float, used_mm) -> list[Note]:
+    """A note if the history has another length of filament than the file's lines."""
+    if not _is_number(used_mm) or abs(printed_mm - used_mm) <= FILAMENT_TOLERANCE * max(used_mm, 1.0):
+        return []
+    message = (
+        f"{path.name} feeds {printed_mm:.0f} mm of filament up to its last position, but Moonraker's history "
+        f"has {used_mm:.0f} mm; macros feed the difference, or the file was changed: check the feed"
+    )
+    return [_note(LEFT_OUT, 1, message)]

@@ -3,17 +3,20 @@ serial.log with the firmware's own reports."""
 
 import json
 import re
+from array import array
 from pathlib import Path
 
 import numpy as np
 import orjson
 
-from pipeline.recordings.formats import Note, WholeTable, check_width
+from pipeline.recordings.formats import Note, WholeTable, check_values, check_width
 from pipeline.recordings.instants import instants, over_midnight
 
 # a temperature store holds twenty minutes, some 100 kB
 LARGEST_JSON = 1 << 25
 LONGEST_LINE = 1 << 14
+# how often the size of what was read is looked at
+LINES_A_CHECK = 10_000
 # Moonraker's lists -> name, unit, factor; one entry a second
 _LISTS = {
     "temperatures": ("temp", "degC", 1.0),
@@ -92,57 +95,82 @@ def load_serial_log(path: Path) -> WholeTable:
     The duty counts to 127, or to 255 where it ever exceeds 127. Raises ValueError for a log without a report
     that has a time.
     """
-    # it takes a moment, which only such logs cost
-    import pandas as pd
-
-    stamps, numbers, rows, untimed = [], [], [], 0
+    rows = _Reports()
     with path.open("rb") as stream:
-        for number, text in enumerate(iter(lambda: stream.readline(LONGEST_LINE), b""), 1):
-            if b"Recv:" not in text or not _REPORT.search(text):
-                continue
-            stamp, row = _STAMP.search(text), _report(text)
-            if stamp and row:
-                stamps.append((stamp[1] or stamp[2]).decode())
-                numbers.append(number)
-                rows.append(row)
-            else:
-                untimed += 1
-    if not rows:
+        number = 0
+        while text := stream.readline(LONGEST_LINE):
+            number += 1
+            if b"Recv:" in text and _REPORT.search(text):
+                rows.add(number, text)
+                if len(rows.lines) % LINES_A_CHECK == 0:
+                    check_values(path, len(rows.lines), len(rows.columns))
+    if not rows.stamps:
         raise ValueError(
             f"{path}: expected lines such as 2025-11-21 13:00:00,500 - Recv: ok T:200.1 /200.0 B:60.0 /60.0, "
-            f"found {untimed} reports without a time; write the log with times (OctoPrint's serial.log)"
+            f"found {rows.untimed} reports without a time; write the log with times (OctoPrint's serial.log)"
         )
-    ns, _, dated = instants(path, "of the log", stamps, numbers, month_first=None)
-    ns, midnights = (ns, 0) if dated else over_midnight(ns)
+    lines = np.frombuffer(rows.lines, np.int64)
+    times = instants(path, "of the log", rows.stamps, lines.tolist(), month_first=None)
+    ns, midnights = (times.ns, 0) if times.dated else over_midnight(times.ns)
+    values = {name: np.frombuffer(column) for name, column in rows.columns.items()}
+    return _serial_table(rows, values, lines, ns, midnights)
+
+
+def _serial_table(rows: "_Reports", values: dict, lines: np.ndarray, ns: np.ndarray, midnights: int):
+    notes, factors = [], {}
     keep = np.r_[True, np.diff(ns) > 0]
-    repeated = int((~keep).sum())
-    counted = (
-        ("repeated", repeated, f"{repeated} reports came at the time of another; left out"),
-        ("idle", untimed, f"{untimed} reports have no time and were left out"),
-        ("clock", midnights, f"the time of day runs over midnight {midnights} times"),
-    )
-    notes = [Note(kind, "", count, message) for kind, count, message in counted if count]
-    table, lines = pd.DataFrame(rows), np.array(numbers)[keep]
-    if "tool0.temp" in table:  # T repeats the tool at work
-        table = table[[name for name in table if not name.startswith("tool.")]]
-    for name in table:
-        if name.endswith(".pwm"):
-            table[name] *= 100 / (255 if table[name].max() > 127 else 127)
-    values = {str(name): column.to_numpy()[keep] for name, column in table.items()}
+    if not keep.all():
+        count = int((~keep).sum())
+        notes.append(Note("repeated", "", count, f"{count} reports came at the time of another; left out"))
+    if rows.untimed:
+        notes.append(Note("idle", "", rows.untimed, f"{rows.untimed} reports have no time and were left out"))
+    if midnights:
+        notes.append(Note("clock", "", midnights, f"the time of day runs over midnight {midnights} times"))
+    if "tool0.temp" in values:  # T repeats the tool at work
+        values = {name: column for name, column in values.items() if not name.startswith("tool.")}
+    for name, column in values.items():
+        full = 255 if np.nanmax(column, initial=0) > 127 else 127
+        factors[name] = 100 / full if name.endswith(".pwm") else 1.0
     units = {name: "percent" if name.endswith(".pwm") else "degC" for name in values}
-    return WholeTable(values, units, ns[keep], "", lambda i: f"line {lines[i]}", notes, {}, {}, {})
+    where = np.flatnonzero(keep)
+    return WholeTable(
+        {name: (column * factors[name])[where] for name, column in values.items()},
+        units,
+        ns[where],
+        "",
+        lambda i: f"line {lines[where[i]]}",
+        notes,
+        {},
+        {},
+        {},
+    )
 
 
-def _report(text: bytes) -> dict[str, float]:
-    """The numbers of a report by "device.temp", "device.target" and "device.pwm"."""
-    row = {}
-    for device, actual, target in _HEAT.findall(text):
-        name = _DEVICES[chr(device[0])] + device[1:].decode()
-        row[f"{name}.temp"] = float(actual)
-        if target:
-            row[f"{name}.target"] = float(target)
-    for device, index, duty in _DUTY.findall(text):
-        row[f"{_DEVICES[device.decode() or 'T']}{index.decode()}.pwm"] = float(duty)
-    if "tool0.temp" in row and "tool.pwm" in row:
-        row.setdefault("tool0.pwm", row["tool.pwm"])
-    return row
+class _Reports:
+    """Reports as they come in; a column that begins late is NaN before."""
+
+    def __init__(self) -> None:
+        self.stamps: list[str] = []
+        self.lines, self.columns, self.untimed = array("q"), {}, 0
+
+    def add(self, line: int, text: bytes) -> None:
+        stamp = _STAMP.search(text)
+        row = {}
+        for device, actual, target in _HEAT.findall(text):
+            name = _DEVICES[chr(device[0])] + device[1:].decode()
+            row[f"{name}.temp"] = float(actual)
+            if target:
+                row[f"{name}.target"] = float(target)
+        for device, index, duty in _DUTY.findall(text):
+            row[f"{_DEVICES[device.decode() or 'T']}{index.decode()}.pwm"] = float(duty)
+        if "tool0.temp" in row and "tool.pwm" in row:
+            row.setdefault("tool0.pwm", row["tool.pwm"])
+        if not stamp or not row:
+            self.untimed += 1
+            return
+        for name in row:
+            self.columns.setdefault(name, array("d", [np.nan]) * len(self.lines))
+        for name, column in self.columns.items():
+            column.append(row.get(name, np.nan))
+        self.stamps.append((stamp[1] or stamp[2]).decode())
+        self.lines.append(line)

@@ -584,3 +584,13 @@ def _in_a_row(hit: np.ndarray, least: int) -> np.ndarray:
     for a, b in zip(edges[::2], edges[1::2], strict=True):
         long_enough[a:b] = b - a >= least
     return long_enough
+
+
+def alternate(intervals_s: np.ndarray) -> bool:
+    """Whether a long interval follows each short one, as with two clocks of one rate, one behind the
+    other."""
+    if len(intervals_s) < 20:
+        return False
+    deviation = intervals_s - intervals_s.mean()
+    power = float(deviation @ deviation)
+    return power > 0 and float(deviation[1:] @ deviation[:-1]) < -0.8 * power

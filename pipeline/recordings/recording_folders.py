@@ -5,7 +5,6 @@ The memo is content-addressed. The hash of the recording, of the wish and of the
 entry, so that one more recording costs one reading. An entry counts if its files have the digests that were
 written last; otherwise the recording is read again."""
 
-import functools
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -126,7 +125,7 @@ def read_folder(
 
 def _growing(files: Sequence[Path]) -> list[Path]:
     """The recordings that change, or whose printed files do."""
-    beside = {path: _companions(path) for path in files}
+    beside = {path: printed_gcode.companions(path) if _is_klippy(path) else [] for path in files}
     watched = dict.fromkeys([*files, *(other for others in beside.values() for other in others)])
     changing = set(plain_files.wait_until_still(list(watched)))
     return [path for path in files if changing.intersection([path, *beside[path]])]
@@ -135,16 +134,19 @@ def _growing(files: Sequence[Path]) -> list[Path]:
 def _printed_beside(files: Sequence[Path]) -> dict[Path, list[tuple[str, str]]]:
     """(name, hash) of each G-code file and history beside a klippy.log, which its fan and feed are from; none
     for another recording."""
-    digest = functools.cache(artifacts.sha256)
-    return {path: [(str(other), digest(other)) for other in _companions(path)] for path in files}
+    beside: dict[Path, list[tuple[str, str]]] = {}
+    for path in files:
+        if path.parent not in beside and _is_klippy(path):
+            companions = printed_gcode.companions(path)
+            beside[path.parent] = [(str(other), artifacts.sha256(other)) for other in companions]
+    return {path: beside.get(path.parent, []) if _is_klippy(path) else [] for path in files}
 
 
-def _companions(path: Path) -> list[Path]:
-    """What lies beside a klippy.log; nothing for another recording, and for a file that is none."""
+def _is_klippy(path: Path) -> bool:
     try:
-        return printed_gcode.companions(path) if file_format(path) == "klippy.log" else []
+        return file_format(path) == "klippy.log"
     except ValueError:
-        return []
+        return False
 
 
 def _recordings_below(
@@ -406,18 +408,18 @@ def printer_pids(
     pids: dict[str, dict] = {}
     logs = [r.name for r in results if not r.reason and file_format(folder / r.name) == "klippy.log"]
     for name in logs:
-        for heater in printer_heaters(folder / name):
-            u, y = of.get(f"{heater.heater}.pwm"), of.get(f"{heater.heater}.temp")
-            if not heater.gains or u is None or y is None or u.signal not in inputs:
+        for pid in [heater.pid for heater in printer_heaters(folder / name) if heater.pid]:
+            u, y = of.get(f"{pid.heater}.pwm"), of.get(f"{pid.heater}.temp")
+            if u is None or y is None or u.signal not in inputs:
                 continue
-            gains = [gain * u.scale / y.scale for gain in heater.gains]
+            gains = [gain * u.scale / y.scale for gain in pid[1:4]]
             pids[u.signal] = {
                 "recording": name,
                 "input": u.signal,
                 "output": y.signal,
                 **dict(zip(("Kp", "Ki", "Kd"), gains, strict=True)),
-                "most_percent": heater.most_percent * u.scale,
-                "smooth_s": heater.smooth_s,
+                "most_percent": pid.most_percent * u.scale,
+                "smooth_s": pid.smooth_s,
             }
     return {"heaters": list(pids.values())} if pids else {}
 

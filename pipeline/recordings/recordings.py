@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.recordings.clocks import repair_topics, start_of
+from pipeline.recordings.clocks import repair_topics
 from pipeline.recordings.csv_files import read_groups
 from pipeline.recordings.formats import (
+    CALENDAR_S,
     NAMES,
     SUFFIXES,
     FileColumns,
@@ -25,14 +26,12 @@ from pipeline.recordings.formats import (
     Source,
     Table,
     WholeTable,
-    convert,
     file_format,
     nearest_names,
     select,
-    told_of,
 )
 from pipeline.recordings.inspection import inspect
-from pipeline.recordings.mcap_files import read_mcap
+from pipeline.recordings.mcap_files import check_magic, mcap_columns, read_bag
 from pipeline.recordings.other_formats import LOADERS
 from pipeline.recordings.parquet_files import read_parquet
 from pipeline.recordings.printed_gcode import NOT_RECORDED, UNITS
@@ -79,8 +78,12 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal
     kind = file_format(path)
     named = SUFFIXES.get(path.suffix.lower(), kind)
     names = list(dict.fromkeys(source.source for source in sources))
-    with told_of(path):
+    try:
         columns, places, messages, notes = _file_columns(path, kind, names, time, decimal)
+    except OSError as error:
+        raise ValueError(
+            f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
+        ) from None
     if kind != named:
         message = (
             f"the file is named {path.suffix.lower()} but begins as {NAMES.get(kind, kind)} does, "
@@ -109,8 +112,12 @@ def _file_columns(
 ) -> tuple[list[FileColumns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
     """Columns on their clocks, {source: (name of its columns, name in them)}, {name: count of messages or
     rows} and notes of a file of that kind."""
-    if kind in ("mcap", "bag"):
-        return read_mcap(path, names, time)
+    if kind == "mcap":
+        with path.open("rb") as stream:
+            check_magic(path, stream.read(16))
+        return mcap_columns(path, names, time)
+    if kind == "bag":
+        return read_bag(path, names, time)
     if kind == "csv":
         columns, notes = read_groups(path, names, time, decimal)
     elif kind in LOADERS:
@@ -138,6 +145,10 @@ def _check_sources(path: Path, sources: Sequence[Source]) -> None:
             f"{path}: the mapping names no signal; map each input and output to a column or topic (beadline "
             "inspect proposes a mapping)"
         )
+    signals = [source.signal for source in sources]
+    twice = sorted({signal for signal in signals if signals.count(signal) > 1})
+    if twice:
+        raise ValueError(f"{path}: the mapping gives {twice[0]} more than one source; give it one")
     for source in sources:
         if not (np.isfinite(source.scale) and np.isfinite(source.offset) and source.scale != 0):
             raise ValueError(
@@ -151,8 +162,12 @@ def _clocks(columns: Sequence[FileColumns], notes: list[Note]) -> dict[str, np.n
     first = min(group.time[0] for group in columns)
     on_calendar = columns[0].time.dtype == np.int64
     unit = 10**9 if on_calendar else 1.0
-    zones = ", ".join(sorted({group.zone or "of no zone" for group in columns}))
-    start = start_of(first, unit, zones, notes)
+    start = first // unit * unit if first > CALENDAR_S * unit else 0
+    if start:
+        zero = np.datetime64(int(start // unit), "s")
+        zones = ", ".join(sorted({group.zone or "of no zone" for group in columns}))
+        message = f"time is counted from {zero} ({zones}, as the recording's clock says)"
+        notes.append(Note("clock", "", 1, message))
     return {group.name: (group.time - start if start else group.time) / unit for group in columns}
 
 
@@ -170,7 +185,15 @@ def _signal(
             f"{path}: {source.source} is in °F but the mapping takes it as {source.unit} with scale "
             f"{source.scale:g}; set scale: 0.555556 and offset: -17.7778"
         )
-    values, present = convert(path, source, recorded), np.isfinite(recorded)
+    present = np.isfinite(recorded)
+    if not present.any():
+        raise ValueError(
+            f"{path}: {source.source} should hold numbers for {source.signal} but all of its "
+            f"{len(recorded)} values are missing; map another source"
+        )
+    values = (
+        recorded if (source.scale, source.offset) == (1.0, 0.0) else recorded * source.scale + source.offset
+    )
     if present.all():
         return time, values
     where = np.flatnonzero(present)

@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from pipeline.recordings.formats import Flag, Jitter, Raw, Table
-from pipeline.recordings.quality import mask_mixed
+from pipeline.recordings.quality import alternate, mask_mixed
 
 # a sample within that share of the sample time from the grid is on it: a temperature's change in a hundredth
 # of a sample is far below any sensor's step
@@ -334,10 +334,15 @@ def _jitter_flags(clocks: Sequence[_Clock]) -> list[Flag]:
         count = np.count_nonzero(inside)
         if len(off) < JITTER_OFTEN * count and jitter.max_s <= 0.5 * jitter.interval_s:
             continue
+        pattern = (
+            ", by turns longer and shorter: two devices may write under one name"
+            if alternate(steps[inside])
+            else ""
+        )
         message = (
             f"the intervals of {', '.join(clock.signals)} differ from {jitter.interval_s:.4g} s by "
             f"{jitter.std_s:.2g} s (standard) and {jitter.max_s:.2g} s (largest), "
-            f"{len(off)} of {count} by more than a tenth"
+            f"{len(off)} of {count} by more than a tenth{pattern}"
         )
         flags.append(
             Flag(

@@ -8,9 +8,7 @@ A recording is read once: the readings of its frames are kept under a hash of it
 settings and of the code that reads.
 """
 
-import hashlib
 import math
-import pickle
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -20,13 +18,13 @@ import joblib
 import numpy as np
 
 from pipeline.recordings.excluded import readable
-from pipeline.recordings.formats import Note, Source, map_sources, told_of
+from pipeline.recordings.formats import Note, Source
 from pipeline.recordings.images import Frames, check_overlap, read_frames, span_of, tables_of, write_frames
 from pipeline.store import artifacts
 from pipeline.store.params import Mapped
+from pipeline.store.tables import BYTES, FLOAT, NONE, TEXT, Column, Schema
 
 SCHEMA, VERSION = "beadline.trial", "1"
-DIGEST_BYTES = 32
 # what a trial has, where our own recordings have it
 POSITION = Source("position_mm", "/gantry:position_mm", "mm")
 SPEED = Source("speed_mm_per_s", "/gantry:speed_mm_per_s", "mm/s")
@@ -41,6 +39,19 @@ TYPES = {
     "/true_flow": "beadline_msgs/msg/TrueFlow",
 }
 
+READINGS = Schema(
+    "trial_readings",
+    2,
+    (
+        Column("time_s", FLOAT, "s", "of the frame, as stamped"),
+        Column("reason", TEXT, NONE, "why the frame has no usable bead; empty if it has"),
+        Column("columns", BYTES, "px", "measured columns, 64-bit floats"),
+        Column("widths", BYTES, "px", "widths there, 64-bit floats; 0 bare, NaN unread"),
+        Column("latency_s", FLOAT, "s", "how late the frames are against the gantry, of the whole recording"),
+        Column("latency_deviation_s", FLOAT, "s", "its standard deviation; missing: not told", nullable=True),
+        Column("edge_px", FLOAT, "px", "by how much widths may be off; missing: no bead", nullable=True),
+    ),
+)
 # the readings of F frames: time_s (F,), columns (m,), widths (F, m), reasons (F,), latency and its deviation,
 # and by how much the widths may be off, px
 Values = tuple[np.ndarray, np.ndarray, np.ndarray, list[str], tuple[float, float], float]
@@ -120,7 +131,8 @@ def write_trial(
     one by one, memory is that of a chunk.
 
     `encoding` is "jpeg" (quality 95, 8 bits only), "png" (level 1) or "raw". Raises ValueError, nothing
-    written, for values that are not finite and times that do not run forward.
+    written, for lengths that differ, values that are not finite, times that do not run forward, frames of
+    changing size or kind, no frame, and frames and signals that do not overlap in time.
     """
     time_s = signals.time_s
     columns = [
@@ -170,13 +182,30 @@ def _crc(pairs: dict[str, str]) -> str:
 def open_trial(
     path: str | Path, *, image: str, time: str, mapping: Mapping[str, Mapped], unreadable_share: float
 ) -> TrialRecording:
-    """A recording through the topics of section `camera`. Raises ValueError as read_trial does, and for a
-    signal in `mapping` that no trial has, and for another unit."""
-    mapped = {name: (m.source, m.unit, m.scale, m.offset) for name, m in mapping.items()}
-    sources = map_sources("a trial", "params.yaml: camera.topics", SOURCES, mapped)
+    """A recording through the topics of section `camera`. Raises ValueError as read_trial does."""
     return read_trial(
-        path, sources=tuple(sources.values()), image=image, time=time, unreadable_share=unreadable_share
+        path, sources=sources(mapping), image=image, time=time, unreadable_share=unreadable_share
     )
+
+
+def sources(mapping: Mapping[str, Mapped]) -> tuple[Source, ...]:
+    """Where a recording has our signals, `mapping` in place of our own topics. Raises ValueError for a signal
+    that no trial has, and for another unit."""
+    by_signal = {source.signal: source for source in SOURCES}
+    for name, place in mapping.items():
+        if name not in by_signal:
+            raise ValueError(
+                f"params.yaml: camera.topics.mapping.{name} is no signal of a trial; "
+                f"map {', '.join(list(by_signal)[:-1])}"
+            )
+        if place.unit != by_signal[name].unit:
+            raise ValueError(
+                f"params.yaml: camera.topics.mapping.{name}.unit is {place.unit} but {name} is in "
+                f"{by_signal[name].unit}; convert with scale and offset, "
+                f"and write unit: {by_signal[name].unit}"
+            )
+        by_signal[name] = Source(name, place.source, place.unit, place.scale, place.offset)
+    return tuple(by_signal.values())
 
 
 def trial_paths(folder: Path) -> list[Path]:
@@ -313,7 +342,7 @@ def read_trial(
     path = Path(path)
     # only the true flow, which no machine knows, may be absent if its source is ours
     optional = {FLOW.signal} if FLOW in sources else ()
-    with told_of(path):
+    try:
         frames, signals, metadata, notes = read_frames(
             path,
             sources,
@@ -323,6 +352,10 @@ def read_trial(
             unreadable_share=unreadable_share,
             optional=optional,
         )
+    except OSError as error:
+        raise ValueError(
+            f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
+        ) from None
     spans = {name: span_of(time_s) for name, (time_s, _) in signals.items()}
     check_overlap(path, span_of(frames.time_s), spans)
     first, last = spans[COMMAND.signal]
@@ -382,16 +415,47 @@ def recall(
     read: Callable[[], Values],
 ) -> Values:
     """The readings of a recording out of `folder`, else those that `read` makes, which are kept if there is a
-    frame. An entry is named by the hash of the recording, of the settings, and of the code that reads; it
-    counts while its content has the digest that stands before it."""
+    frame. An entry is named by the hash of the recording, of the settings, and of the code that reads."""
     what = ((artifacts.sha256(recording), settings), [artifacts.sha256(path) for path in code])
-    place = folder / f"{joblib.hash(what)}.pickle"
-    if place.is_file():
-        kept = place.read_bytes()
-        if hashlib.sha256(kept[DIGEST_BYTES:]).digest() == kept[:DIGEST_BYTES]:
-            return pickle.loads(kept[DIGEST_BYTES:])
+    place = folder / f"{joblib.hash(what)}.parquet"
+    entry = _recall_entry(place)
+    if entry is not None:
+        return entry
     values = read()
     if len(values[0]):
-        content = pickle.dumps(values)
-        artifacts.write_bytes(place, hashlib.sha256(content).digest() + content)
+        _remember(place, values)
     return values
+
+
+def _remember(place: Path, values: Values) -> None:
+    time_s, columns, widths, reasons, (latency_s, deviation_s), edge_px = values
+    count = len(time_s)
+    table = {
+        "time_s": time_s,
+        "reason": np.array(reasons, object),
+        "columns": [columns.astype("<f8").tobytes()] * count,
+        "widths": [row.astype("<f8").tobytes() for row in widths],
+        "latency_s": np.full(count, latency_s),
+        "latency_deviation_s": np.full(count, deviation_s if np.isfinite(deviation_s) else np.nan),
+        "edge_px": np.full(count, edge_px),
+    }
+    artifacts.write_table(place, READINGS, table)
+
+
+def _recall_entry(place: Path) -> Values | None:
+    """The readings of an entry; None if there is none, or if the checksums of its pages do not hold."""
+    try:
+        table = artifacts.read_table(place, READINGS)
+    except ValueError:
+        return None
+    if not len(table["time_s"]):
+        return None
+    deviation_s = float(table["latency_deviation_s"][0])
+    return (
+        np.asarray(table["time_s"], float),
+        np.frombuffer(table["columns"][0], "<f8"),
+        np.stack([np.frombuffer(row, "<f8") for row in table["widths"]]),
+        [str(reason) for reason in table["reason"]],
+        (float(table["latency_s"][0]), deviation_s if np.isfinite(deviation_s) else np.inf),
+        float(table["edge_px"][0]),
+    )

@@ -340,10 +340,15 @@ def test_a_topic_whose_recorder_was_restarted_gives_the_frames_of_both_channels(
 
 
 def test_frames_and_command_without_a_common_time_are_refused_with_both_ranges(tmp_path):
-    late = written(tmp_path / "trial.mcap", frames=((time + 5, frame) for time, frame in pictures()))
-    assert "the frames run from 5.000 to 6.967 s but position_mm from 0.000 to 1.980 s, so they" in refusal(
-        late
-    )
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"the frames run from 5.000 to 6.967 s but signals from 0.000 to 1.980 s, so they do not "
+            r"overlap in time; record both"
+        ),
+    ):
+        written(tmp_path / "trial.mcap", frames=((time + 5, frame) for time, frame in pictures()))
+    assert list(tmp_path.iterdir()) == []
     made = Written()
     stage, camera = (
         made.topic("/gantry", "json"),
@@ -427,7 +432,13 @@ def test_of_two_cameras_one_must_be_named(tmp_path):
     )
 
 
-def test_frames_of_changing_size_are_refused_in_reading(tmp_path):
+def test_frames_of_changing_size_are_refused_in_writing_and_in_reading(tmp_path):
+    with pytest.raises(
+        ValueError,
+        match=r"frame 1 is \(24, 64\) of uint8 but the first is \(48, 64\) of uint8; write one size",
+    ):
+        written(tmp_path / "trial.mcap", frames=iter([(0.0, picture(0)), (0.1, picture(1, height=24))]))
+    assert list(tmp_path.iterdir()) == []
     path = tmp_path / "machine.mcap"
     path.write_bytes(
         machine_recording(
@@ -483,8 +494,19 @@ def test_a_jpeg_that_is_cut_off_is_no_frame(tmp_path):
     [
         ({"command_mm": np.where(TIME == TIME[7], np.nan, 0.0)},
         "command_mm is not finite at sample 7; leave that sample out"),
+        ({"command_mm": TIME[:-1]},
+        r"command_mm should have one value for each of 100 times but has shape \(99,\)"),
         ({"time_s": TIME[::-1]}, "time_s should run forward from 0 or later"),
         ({"time_s": TIME - 1}, "time_s should run forward from 0 or later"),
+        ({"frames": iter([])}, "a trial should have frames but there is none; give at least one"),
+        ({"frames": iter([(1.0, picture(0)), (1.0, picture(1))])},
+        "frame 1 is at 1 s but frames should run forward"),
+        ({"frames": iter([(np.nan, picture(0))])}, "frame 0 is at nan s but frames should run forward"),
+        ({"frames": iter([(0.0, np.zeros((4, 4, 3), np.uint8))])},
+        r"frame 0 should be \(height, width\) of uint8 or uint16 but is \(4, 4, 3\) of uint8; make it gray"),
+        ({"frames": pictures(dtype=np.uint16), "encoding": "jpeg"},
+        r"frame 0 should be \(height, width\) of uint8 but is \(48, 64\) of uint16"),
+        ({"encoding": "gif"}, "the encoding should be jpeg, png or raw but is 'gif'; name one of them"),
     ],
 )  # fmt: skip
 def test_what_is_not_a_trial_is_not_written_and_the_last_good_one_stays(tmp_path, changes, message):

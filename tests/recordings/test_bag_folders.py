@@ -88,3 +88,18 @@ def test_metadata_that_swells_when_it_is_written_out_is_refused_at_once(tmp_path
     (path / "metadata.yaml").write_text(text)
     with pytest.raises(ValueError, match="ros2 bag reindex run"):
         read(path, SOURCES)
+
+
+def test_a_part_that_stands_far_from_the_others_is_named_as_perhaps_of_another_recording(tmp_path):
+    path = bag(tmp_path / "run")
+    assert not [note for note in read(path, SOURCES).notes if "another recording" in note.message]
+    made = Written(NO)
+    for topic in ("/heater/duty", "/zone_1/temperature"):
+        number = made.topic(topic, "cdr", "std_msgs/msg/Float64", "ros2msg", FLOAT64)
+        for k in range(40):
+            made.message(number, 5000 + k, cdr(("d", [1.0])))
+    (path / "run_1.mcap").write_bytes(made.bytes())
+    notes = [note.message for note in read(path, SOURCES).notes]
+    # the first part ends at 39 s
+    apart = "two parts hold /heater/duty 4961 s apart, longer than they last: "
+    assert f"{apart}one of them may be of another recording" in notes

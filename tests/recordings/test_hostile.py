@@ -183,5 +183,5 @@ def test_a_picture_that_promises_more_pixels_than_memory_is_unreadable(tmp_path,
     channel = topics(path)["/machine"].channels[0]
     file = McapFile(path)
     messages = next(file.batches(lambda one: True))[channel.id].data
-    with pytest.raises(UnreadableMessage, match=r"bytes of format '\w+' are no whole picture|do not go with"):
+    with pytest.raises(UnreadableMessage, match=r"its header says \d+ x \d+ px|do not go with"):
         gray(reader(channel)(messages[0]))

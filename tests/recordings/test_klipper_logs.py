@@ -89,7 +89,7 @@ def test_the_printers_own_pid_and_limits_are_those_of_its_configuration(tmp_path
     for model in (EXTRUDER, BED):
         heater = heaters[model.name]
         gains = np.array(model.pid) * 100 / 255  # Klipper's pid_Kp are of a duty of 0 to 255
-        np.testing.assert_allclose(heater.gains, gains, rtol=1e-12)  # one multiplication apart
+        np.testing.assert_allclose(heater.pid[1:4], gains, rtol=1e-12)  # one multiplication apart
         assert (heater.low_degC, heater.high_degC, heater.most_percent) == (0, model.max_temp, 100)
     assert load_klippy(path).limits["extruder.temp"] == (0.0, 260.0)
     assert "the printer holds extruder by its own PID (pid_Kp 22.2, pid_Ki 1.08, pid_Kd 114)" in inspect(path)
@@ -97,7 +97,7 @@ def test_the_printers_own_pid_and_limits_are_those_of_its_configuration(tmp_path
 
 def test_a_heater_that_switches_on_and_off_has_no_pid(tmp_path, log):
     path = write(tmp_path, log.replace("control = pid", "control = watermark"))
-    assert [(heater.control, heater.gains) for heater in printer_heaters(path)] == [("watermark", ())] * 2
+    assert [(heater.control, heater.pid) for heater in printer_heaters(path)] == [("watermark", None)] * 2
 
 
 def test_inspect_proposes_heaters_temperatures_limits_and_set_points(tmp_path, log):
@@ -143,6 +143,8 @@ def test_a_time_that_no_calendar_has_is_told_and_not_used(tmp_path, log):
     assert undated[start] != lines[start]
     table = load_klippy(write(tmp_path, "\n".join(undated) + "\n"))
     assert table.time.dtype == float and table.time[-1] < 1e6  # by the computer's own count
+    message = next(one.message for one in table.notes if one.kind == "damage")
+    assert message.startswith(f"the start in line {start + 1} gives no time of day that can be")
 
 
 def test_a_line_without_an_end_takes_no_memory_of_its_size(tmp_path, log):

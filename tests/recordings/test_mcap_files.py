@@ -158,10 +158,15 @@ def test_messages_without_any_crc_are_read_and_said_to_be_unchecked(tmp_path):
     assert [note.kind for note in raw.notes] == ["unchecked"]
 
 
-@pytest.mark.parametrize(("old", "new"), [(b"\r\n", b"\n"), (b"\n", b"\r\n"), (b"\r\n", b"\r")])
-def test_converted_line_ends_are_refused_with_what_converts_them(tmp_path, old, new):
+@pytest.mark.parametrize(
+    ("old", "new", "how"),
+    [(b"\r\n", b"\n", "CR LF to LF"), (b"\n", b"\r\n", "LF to CR LF"), (b"\r\n", b"\r", "CR LF to CR")],
+)
+def test_converted_line_ends_are_named_as_such(tmp_path, old, new, how):
     with pytest.raises(
-        ValueError, match=r"offset 0 should be MCAP's 89 4d 43 41 50 30 0d 0a .* as binary: .*\.gitattributes"
+        ValueError,
+        match=rf"offset 0 should be 89 4d 43 41 50 30 0d 0a .* line ends were converted "
+        rf"\({how}\).*\.gitattributes",
     ):
         opened(tmp_path, json_recording(SAMPLES).replace(old, new))
 

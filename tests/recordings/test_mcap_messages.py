@@ -59,6 +59,20 @@ def test_what_is_no_json_is_unreadable():
             numbers(message, "a")
 
 
+def test_a_json_schema_names_fields_before_any_message():
+    schema = {
+        "properties": {
+            "a": {"type": "number"},
+            "n": {"type": "string"},
+            "b": {"type": "object", "properties": {"c": {"type": "integer"}}},
+        }
+    }
+    assert fields(JSON._replace(schema_encoding="jsonschema", schema=json.dumps(schema).encode()), []) == [
+        "a",
+        "b.c",
+    ]
+
+
 def test_other_encodings_are_refused_with_those_that_are_read():
     for encoding, schema in (("cdr", "ros2idl"), ("flatbuffer", "flatbuffer"), ("cbor", ""), ("cdr", "")):
         with pytest.raises(

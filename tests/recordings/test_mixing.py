@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pipeline.recordings.quality import find_mixed
+from pipeline.recordings.quality import alternate, find_mixed
 from pipeline.recordings.recordings import Raw, resample
 
 
@@ -95,3 +95,10 @@ def test_what_is_mixed_is_masked_with_its_place_though_the_table_would_show_one_
     assert (flag.signal, flag.start_s, flag.end_s, flag.count) == ("y", 0.0, 299.5, 600)
     assert table.masked["y"].all()
     assert "two devices seem to write under one name; record each under a name of its own" in flag.message
+
+
+def test_intervals_that_alternate_are_two_clocks_and_jitter_is_one():
+    assert alternate(np.diff(np.sort(np.r_[np.arange(100.0), np.arange(100) + 0.3])))
+    rng = np.random.default_rng(0)
+    assert not alternate(np.diff(np.arange(200) + 0.1 * rng.standard_normal(200)))
+    assert not alternate(np.ones(200))

@@ -13,7 +13,7 @@ from pipeline.recordings import plain_files, recording_folders
 from pipeline.recordings.formats import Raw
 from pipeline.recordings.inspection import inspect
 from pipeline.recordings.klipper_logs import fan_macros, load_klippy, printed_files
-from pipeline.recordings.printed_gcode import BLOCK, FAN, FEED, NOT_RECORDED, companions, read_file
+from pipeline.recordings.printed_gcode import BLOCK, FAN, FEED, LEFT_OUT, NOT_RECORDED, companions, read_file
 from pipeline.recordings.recordings import Source, read
 from pipeline.recordings.resampling import resample
 from tests.recordings.printing_machine import Machine, gcode, slice_box
@@ -93,6 +93,19 @@ def test_feed_and_fan_are_those_of_the_motion(tmp_path, slicer, end, high_s):
     assert {0.0, 50.0, 100.0} <= set(table.values[FAN].tolist())
 
 
+def test_positions_that_count_characters_find_a_file_with_other_letters(tmp_path, printed):
+    machine, files = printed
+    files = {name: content.replace("ü".encode(), b"ue") for name, content in files.items()}
+    plain = load_klippy(write(tmp_path / "plain", machine, files))
+    # as many characters in more bytes
+    spelt = {name: content.replace(b";LAYER", ";LÁYĚR".encode()) for name, content in files.items()}
+    assert all(len(spelt[name]) > len(content) + 10 for name, content in files.items())
+    table = load_klippy(write(tmp_path / "spelt", machine, spelt))
+    assert not messages(table, NOT_RECORDED)
+    for name in (FAN, FEED):
+        np.testing.assert_array_equal(table.values[name], plain.values[name])
+
+
 def test_in_a_pause_and_between_prints_nothing_is_fed(tmp_path, printed):
     machine, files = printed
     table = load_klippy(write(tmp_path, machine, files))
@@ -111,9 +124,12 @@ def test_a_print_that_was_cancelled_counts_up_to_its_last_position(tmp_path):
     machine.heat(215, 60)
     machine.print_file("a.gcode", lines, stop_at=len(lines) // 2)
     machine.wait(machine.now + 20)
+    machine.jobs[0]["filament_used"] *= 0.9
     files = {"a.gcode": gcode(lines), "history.json": json.dumps(machine.history()).encode()}
     table = load_klippy(write(tmp_path, machine, files))
     assert table.values[FEED].sum() == pytest.approx(machine.e, rel=0.01)
+    note = next(one for one in messages(table, LEFT_OUT) if "history has" in one)
+    assert note.startswith(f"a.gcode feeds {machine.e:.0f} mm") and f"{0.9 * machine.e:.0f} mm" in note
 
 
 def test_a_log_that_begins_within_a_print_has_its_fan_and_its_feed(tmp_path, printed):
@@ -181,7 +197,7 @@ HISTORY = json.dumps(MACHINE.history()).encode()
         ({"a.gcode": CONTENT.replace(b"\n", b"\r\n")}, SIZE + "a.gcode has "),
         ({"a.gcode": JUNK}, SIZE + "a.gcode has other lines"),
         ({"a.gcode": b""}, SIZE + "a.gcode has 0 bytes"),
-        ({"a.gcode": CUT, "b.g": OTHER}, SIZE + "a.gcode has"),
+        ({"a.gcode": CUT, "b.g": OTHER}, SIZE + "2 G-code files, none of which fits"),
         ({"a.gcode": CUT, "b.g": OTHER, "h.json": HISTORY}, f"found a.gcode has {len(CUT)} bytes"),
         ({"a.gcode": CONTENT, "b.g": CONTENT.replace(b"M107", b"M106")}, "found a.gcode and b.g; leave the"),
     ],

@@ -236,7 +236,7 @@ def test_zeros_after_a_power_failure_are_left_out_and_noted(tmp_path):
         ),
         (
             "t,u,y\n0,1,2\n1,warm,2\n",
-            "line 3, column u should be a number but is 'warm'; write it without unit",
+            "line 3, column u should be a number but is 'warm'; mend that line, or leave the field empty",
         ),
         (
             "t,u,y\n0,1,2\n1,1\n2,1,2\n",
@@ -248,17 +248,17 @@ def test_zeros_after_a_power_failure_are_left_out_and_noted(tmp_path):
         ),
         (
             "t,u,y\n0,1,2\n1,20 %,2\n",
-            "line 3, column u should be a number but is '20 %'; write it without unit",
+            "line 3, column u should be a number but is '20 %'; write the numbers without their unit",
         ),
         (
             "t;u;y\n0;1234,5;2\n1;1.234,5;2\n",
             "line 3, column u should be a number but is '1.234,5'; "
-            "write it without unit and marks between thousands, with a comma before decimals",
+            "write the numbers without marks between thousands",
         ),
         (
             "t;u;y\n0;1,5;2\n1;1.234;2\n2;2,5;2\n",
-            "line 3, column u should be a number but is '1.234'; "
-            "write it without unit and marks between thousands",
+            "line 3, column u should be a number but is '1.234'; it may be 1.234 or 1234: "
+            "declare ingest.decimal, or write the numbers without marks between thousands",
         ),
         (
             "t;u;y\n0;1,500;2\n1;1,250;2\n",
@@ -266,7 +266,7 @@ def test_zeros_after_a_power_failure_are_left_out_and_noted(tmp_path):
             'declare ingest.decimal: "," for 1.500, or "." for 1500',
         ),
         ("t\tu\ty\n0\t1.500\t2\n1\t1.250\t2\n", "1.500 may be 1.500 or 1500, as every fraction"),
-        ('t,u,y\n0,"1,500",2\n1,"1,250",2\n', "is '1,500'; write it without unit and marks"),
+        ('t,u,y\n0,"1,500",2\n1,"1,250",2\n', "it may be 1.500 or 1500: declare ingest.decimal"),
         (
             "t,u,y\n" + "".join(f"{k + 100 * (k % 2)},1,2\n" for k in range(40)),
             "the first of 19, but time should only run forward; two devices with clocks of their own seem to "
@@ -340,6 +340,7 @@ def test_a_folder_and_a_missing_file_are_refused(tmp_path):
 def test_mappings_that_make_no_sense_are_refused(tmp_path):
     for sources, sentence in (
         ([], "the mapping names no signal"),
+        ([SOURCES[0], SOURCES[0]], "gives u more than one source"),
         ([Source("u", "u", "percent", 0.0)], "has scale 0 and offset 0; both must be finite, scale not 0"),
     ):
         assert sentence in refusal(tmp_path, "t,u,y\n0,1,2\n", sources)

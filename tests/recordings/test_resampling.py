@@ -218,6 +218,11 @@ def test_jitter_is_told_with_its_size_and_place_and_a_steady_clock_has_none():
     assert (flag.start_s, flag.end_s, flag.count) == (99.0, 101.0, 2)
 
 
+def test_two_clocks_one_behind_the_other_are_told():
+    (flag,) = flags_of(np.sort(np.r_[np.arange(100.0), np.arange(100) + 0.3]), "jitter")
+    assert "by turns longer and shorter: two devices may write under one name" in flag.message
+
+
 def test_a_gap_of_an_hour_and_an_interval_may_be_summer_time():
     time = np.arange(300.0)
     time[150:] += 3600
