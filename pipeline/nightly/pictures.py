@@ -122,7 +122,9 @@ def of_prints(folder: Path, champion: Path, most: int, only: Sequence[str] = ())
     numbered = [(number, name) for number, name in enumerate(frames.prints) if not only or name in only]
     for number, name in numbered[-most:]:
         here = frames.print_number == number
-        seen = here & frames.valid
+        seen = here & frames.valid & (frames.label >= 0)
+        if not seen.any() and (here & frames.valid).any():  # its flow is not known
+            continue
         classes = np.bincount(frames.label[seen], minlength=3).tolist()
         together = float(here.sum() / len(np.unique(frames.segment[here])))
         contrast: tuple[np.ndarray, np.ndarray] = np.zeros(0), np.zeros(0)

@@ -13,6 +13,7 @@ from pipeline.deposition.camera import rendering
 from pipeline.nightly import camera_drift, pictures, screening
 from pipeline.nightly.records import NightDrift
 from pipeline.nightly.settings import Nightly
+from pipeline.recordings import nozzle_frames
 from pipeline.setpoint.recordings import read_frames
 from pipeline.setpoint.settings import TrainClassifier
 from pipeline.setpoint.vision import own_pictures
@@ -207,6 +208,22 @@ def test_a_print_as_the_champion_s_classifier_sees_it(camera, monkeypatch, zoom,
     share = 100 * one.familiar[1] / max(sum(one.familiar), 1)
     assert foreign[0] <= share <= foreign[1]
     assert sum(one.counts) == 144 and sum(one.familiar) == sum(one.counts[:3])
+
+
+def test_frames_of_no_known_flow_are_left_out_and_a_print_of_such_frames_alone_too(camera, monkeypatch):
+    monkeypatch.chdir(camera[0])
+    read = nozzle_frames.read_folder
+
+    def without_flow(*arguments):
+        frames = read(*arguments)
+        unknown = frames.print_number == frames.prints.index("0")
+        unknown[np.flatnonzero(frames.print_number == frames.prints.index("5"))[:1]] = True
+        return frames._replace(label=np.where(unknown, -1, frames.label))
+
+    monkeypatch.setattr(nozzle_frames, "read_folder", without_flow)
+    rows = pictures.of_prints(PRINTS, Path("champion/setpoint"), 9)
+    assert [one.name for one in rows] == ["1", "2", "3", "4", "5"]
+    assert [sum(one.counts) for one in rows] == [144, 144, 144, 144, 143]
 
 
 def test_frames_that_the_classifier_never_saw_the_like_of_are_named_without_a_label():
