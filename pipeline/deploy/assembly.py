@@ -28,6 +28,8 @@ from pipeline.temperature.test_set.scorecard import closed_loop
 from pipeline.temperature.tracking import reached_state, riccati
 
 LEAK = 0.9999  # of the drift, kept a step
+RESTLESS = 1e8  # condition of I - A above which a plant has no rest of its own
+WEAK_SHARE = 1e-3  # of what inputs move most, below which they are not said to hold a temperature
 HURRIED = 0.1  # of an innovation, by which the drift follows in manual
 # what takes over if the law is left: the control that the machine has, or a PI in its place
 OWN_CONTROL = ("printer_pid", "pi", "pi_simc")
@@ -90,7 +92,7 @@ def supervision(
     moved = likely * follows * noise
     P = riccati(A.T, C.T, scipy.linalg.block_diag(moved @ moved.T, np.diag((drift * noise) ** 2)), sensors)
     M = P @ C.T @ np.linalg.inv(C @ P @ C.T + sensors)
-    heat = np.vstack([likely, np.zeros((p, p))])
+    held, rest = held_state(plant, likely)
     pulses = np.abs(markov_parameters(plant, 60)).max(axis=0)
     shares = pulses / np.maximum(pulses.max(axis=1, keepdims=True), 1e-300)
     of_input = (shares + 1e-6 * pulses / max(pulses.max(), 1e-300)).argmax(axis=0)
@@ -113,8 +115,8 @@ def supervision(
         hurried=np.vstack([np.zeros((n, p)), HURRIED * np.eye(p) - (A @ M)[n:]]),
         unsure=unsure,
         wander=np.cumsum((2 * unsure) ** 2, axis=0),
-        start=heat,
-        start_0=-heat @ plant.d,
+        start=np.vstack([held, np.zeros((p, p))]),
+        start_0=np.r_[rest, np.zeros(p)],
         low=np.array([one.low for one in machine.inputs]),
         high=np.array([one.high for one in machine.inputs]),
         coldest=np.array([one.low for one in machine.outputs]),
@@ -127,6 +129,22 @@ def supervision(
         sample_time_s=machine.sample_time_s,
         reach_degC=max(0.5, 3 * float(noise.max())),
     )
+
+
+def held_state(plant: Plant, likely: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """N (n, p) and x (n,) of the state N y + x, which inputs hold for long at outputs y (p,):
+
+        x = A x + B u + b,  C x + d = y
+
+    so that what lies behind the sensors of a machine that is found warm, walls or a barrel, is warm too. What
+    no input holds, and a plant without a rest, is moved along `likely` (n, p), with C likely = I."""
+    slow = np.eye(plant.n) - plant.A
+    if np.linalg.cond(slow) > RESTLESS:
+        return likely, -likely @ plant.d
+    moved, rest = np.linalg.solve(slow, plant.B), np.linalg.solve(slow, plant.b)
+    N = moved @ np.linalg.pinv(plant.C @ moved, rcond=WEAK_SHARE)
+    N += likely @ (np.eye(plant.p) - plant.C @ N)
+    return N, rest - N @ (plant.C @ rest + plant.d)
 
 
 KINDS = ("sequence", "disturbed")  # set-point changes, and a door, a fan and another room

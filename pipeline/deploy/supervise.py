@@ -128,6 +128,8 @@ SHOWN = 6  # samples in a row that show a fault
 SLOWLY = 1 / 60  # share a sample of the mean drift, from which heat is counted
 EARLY, JUMP = 0.5, 10.0  # shares of the sample time between which two samples are apart
 MOST_STEP_DEGC = 5.0  # what moves by more at first was perhaps switched on
+# a sensor's steps until it has moved: one of 2.5 degC moves before its forecast has moved enough to judge it
+UNKNOWN_STEP_DEGC = 1.0
 # shares of an input's range, of heat that is missing; with the heater at its limit
 MISSING, AT_LIMIT = 0.4, 0.1
 MISSING_FOR, DOOR_S = 60, 110.0  # for so many samples, and longer than a door is open
@@ -144,11 +146,11 @@ class Supervision(NamedTuple):
     states; L, M (n, p) move its state by an innovation, from one sample to the next and at once; `hurried` is
     added to L in manual; `unsure` (WINDOWS SPACING + 1, p) in degC is the deviation of a forecast by its age,
     `wander` the sum of four times its squares.
-    It starts at start y + start_0. low, high (m,) in percent; `coldest`, `hottest` (p,) in degC between which
-    a reading is one. Pairs (q,) of an output `of_input` and an input `input_of`: first the output in which
-    each input has the largest share, then the outputs that are left, with the input that moves them most.
-    `heat` (m, p) is the share of the inputs' range that a drift of 1 stands for, `missing_for` the samples
-    for which heat must be missing.
+    It starts at start y + start_0, the state in which inputs hold y for long. low, high (m,) in percent;
+    `coldest`, `hottest` (p,) in degC between which a reading is one. Pairs (q,) of an output `of_input` and
+    an input `input_of`: first the output in which each input has the largest share, then the outputs that
+    are left, with the input that moves them most. `heat` (m, p) is the share of the inputs' range that a
+    drift of 1 stands for, `missing_for` the samples for which heat must be missing.
     """
 
     A: np.ndarray
@@ -181,8 +183,8 @@ class Supervision(NamedTuple):
 
 
 def known_steps(quantum: np.ndarray) -> np.ndarray:
-    """Steps of sensors (p,) in degC; large ones as long as they are not known."""
-    return np.where(np.isfinite(quantum), quantum, MOST_STEP_DEGC)
+    """Steps of sensors (p,) in degC; UNKNOWN_STEP_DEGC as long as they are not known."""
+    return np.where(np.isfinite(quantum), quantum, UNKNOWN_STEP_DEGC)
 
 
 class Exported(NamedTuple):

@@ -559,3 +559,46 @@ def test_a_restart_while_hot_is_no_fault_and_a_heater_that_is_stuck_on_then_is_n
         kinds |= {cause.kind for cause in decision.causes}
         machine.advance(100.0 if stuck_on else decision.u[0], 0.0, 1.0)
     assert kinds == named
+
+
+WALLED = plant([[0.8, 0.19], [0.004, 0.995]], [[0.114], [0.0]], [[1.0, 0.0]], d=[ROOM])
+WIRED_WALLED = Machine(WIRED.inputs[:1], WIRED.outputs[:1], 1.0)
+
+
+@pytest.mark.parametrize(("held", "wall"), [(80.0, 0.25), (80.0, 0.5), (80.0, 1.0), (155.0, 1.0)])
+@pytest.mark.parametrize("asked", [-12.0, 0.0, 12.0])
+def test_a_machine_that_is_found_warm_is_left_to_the_law(held, wall, asked):
+    """A slow wall behind the sensor is as warm as after hours at `held` degC, or has a share of it; and a
+    sensor that stands still later is named, and one that never moved turns heaters off that heat."""
+    low, high, noise, r = np.zeros(1), np.full(1, 100.0), np.full(1, NOISE), held + asked
+    pairs = baseline.pairing(WALLED, low, high, horizon=400, noise_degC=noise)
+    limits = ActuatorLimits(low, high, np.full(1, np.inf))
+    law = deploy(baseline.pi_law(pairs, inputs=1), limits, integral_limit=1.0)
+    watched = supervision(WALLED, WIRED_WALLED, noise)
+
+    def life(steps: int, *, stuck_from: int) -> list[supervise.Decision]:
+        made = Exported("pi", WIRED_WALLED, law, WALLED, law, watched, True, "", "")
+        one, rng, decisions = Supervised(made, rehearsal=True), np.random.default_rng(0), []
+        last = np.array([held])
+        x = np.array([1.0, 0.8 * wall]) * (held - ROOM)  # at rest the wall has 0.8 of the rise
+        u = ((np.eye(2) - WALLED.A) @ x)[:1] / WALLED.B[0]
+        for t in range(steps):
+            y = WALLED.C @ x + WALLED.d + NOISE * rng.standard_normal(1)
+            y = last if t > stuck_from else y
+            last = y
+            if t == 30:
+                one.hand_over(y)
+            if t < 30:
+                one.watch(u, y, np.array([r]))
+            else:
+                decisions.append(one.step(y, np.array([r]), float(t)))
+                u = decisions[-1].u
+            x = WALLED.A @ x + WALLED.B @ u
+        return decisions
+
+    assert {one.mode for one in life(400, stuck_from=400)} == {"law"}
+    if asked:
+        assert first(life(100, stuck_from=30))[1].kind == "sensor_still"
+    if asked > 0:
+        # a wall that is cold takes for long what the sensor does not show
+        assert first(life(200, stuck_from=-1))[0] <= (15 if wall == 1 else 140)

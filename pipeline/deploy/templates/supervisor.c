@@ -55,10 +55,10 @@ static int pass_time(supervisor_kept *k, beadline_clock t)
     return sane && gap > REAL(1.5) ? (int)(gap + REAL(0.5)) : 1;
 }
 
-/* Steps of a sensor in degC; large ones as long as they are not known */
+/* Steps of a sensor in degC; UNKNOWN_STEP_DEGC as long as they are not known */
 static real steps_of(const supervisor_kept *k, int j)
 {
-    return isfinite(k->quantum[j]) ? k->quantum[j] : MOST_STEP_DEGC;
+    return isfinite(k->quantum[j]) ? k->quantum[j] : UNKNOWN_STEP_DEGC;
 }
 
 /* Which outputs count now; says which gives no number, or one out of its range */
