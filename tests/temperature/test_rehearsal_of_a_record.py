@@ -76,6 +76,11 @@ def test_both_halves_have_the_lag_that_a_model_of_one_mode_does_not_hold():
         assert kept.max() <= np.exp(-1 / (panel.LAG * 1.21 * 100))
 
 
+def test_the_machine_of_the_study_is_known_to_have_no_lag_in_series():
+    assert panel.spread_of(settings()).lag == 0.0
+    assert panel.spread_around(settings(), linear([[0.99]], [[0.01]], [[1.0]])).lag == panel.LAG
+
+
 def test_a_slow_bed_has_its_own_time_band_and_length(family):
     judged = rehearsal(family)
     assert judged.settling_s is not None and 600 < judged.settling_s < 1500  # three times some 300 s

@@ -817,14 +817,16 @@ def spread_of(settings: Panel) -> PlantSpread:
         settings.extra_heat_loss_per_step,
         settings.delayed,
         settings.ambient_degC,
-        LAG,
     )
 
 
 def spread_around(settings: Panel, identified: Plant) -> PlantSpread:
-    """The declared spread, with no more heat lost than is little beside what somebody's machine loses."""
+    """The declared spread, with no more heat lost than is little beside what somebody's machine loses, and
+    with a lag, which the study's machine is known not to have."""
     spread, slowest = spread_of(settings), 1 - np.abs(np.linalg.eigvals(identified.A)).max()
-    return spread._replace(extra_heat_loss=float(np.clip(0.2 * slowest, 0.0, spread.extra_heat_loss)))
+    return spread._replace(
+        extra_heat_loss=float(np.clip(0.2 * slowest, 0.0, spread.extra_heat_loss)), lag=LAG
+    )
 
 
 def from_declaration(settings: Panel, machine: Machine, truth: Plant, family: Sequence[Plant]) -> Rehearsal:
