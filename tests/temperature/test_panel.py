@@ -70,6 +70,101 @@ def test_a_late_plant_does_a_sample_later_what_the_other_does_at_once():
     np.testing.assert_allclose(late, shifted, rtol=1e-12)
 
 
+ONE_MODE = plant([[0.99]], [[0.01]], [[1.0]], b=[0.2])  # 100 samples, 20 °C where nothing heats it
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_lag_in_series_keeps_the_steady_state_and_is_behind_by_its_time_constant(late):
+    behind = panel.delayed(ONE_MODE, late, lag=5.0)
+    u = np.full((4000, 1), 50.0)
+    at_once, lagged = (
+        simulate(one, u, np.r_[20.0, np.zeros(one.n - 1)])[1][:, 0]
+        for one in (panel.delayed(ONE_MODE, late), behind)
+    )
+    np.testing.assert_allclose([at_once[-1], lagged[-1]], 70.0, atol=1e-9)
+    assert (lagged[1:] <= at_once[1:]).all() and (np.diff(lagged) >= -1e-9).all()
+    # the lag misses sum k^(t + 1) = k / (1 - k) samples of 50 °C, k = exp(-1 / 5)
+    missed = 50.0 / np.expm1(1 / 5)
+    np.testing.assert_allclose((at_once - lagged).sum(), missed, rtol=1e-9)
+
+
+def test_a_lag_below_a_sample_is_none():
+    for late in (False, True):
+        for one, other in zip(
+            panel.delayed(ONE_MODE, late), panel.delayed(ONE_MODE, late, 0.99), strict=True
+        ):
+            np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_machine_with_a_lag_that_is_held_stays_where_it_is(late):
+    machine = panel.delayed(ONE_MODE, late, 5.0)
+    cases = lag_cases([machine], start=60.0)
+    y = simulate(machine, np.tile(cases.u0[0], (50, 1)), cases.x0[0])[1]
+    np.testing.assert_allclose(y, 60.0, atol=1e-9)
+
+
+def test_machines_with_and_without_lag_run_together_as_they_run_alone():
+    machines = [panel.delayed(ONE_MODE, late, lag) for late, lag in ((False, 0.0), (False, 5.0), (True, 3.0))]
+    together, *alone = (lagging(some) for some in (machines, *([one] for one in machines)))
+    np.testing.assert_allclose(together, np.hstack(alone), rtol=1e-12)  # rounding
+    assert np.abs(np.diff(together[20])).min() > 0.1  # they differ
+
+
+def lag_cases(machines: list, start: float) -> Cases:
+    """Held at `start` °C, then towards 100 °C."""
+    return panel.asked(
+        machines,
+        Questions(np.array([[start]]), np.array([[100.0]]), None, None, None),
+        noise=np.zeros(1),
+        seed=1,
+        steps=50,
+        hold=1,
+        cells=False,
+        structures=(panel.Structure(),),
+    )
+
+
+def lagging(machines: list) -> np.ndarray:
+    """True outputs (steps, machines) from 20 °C under a proportional law."""
+    law, cases = static(0.5), lag_cases(machines, start=20.0)
+    limits = ActuatorLimits(np.zeros(1), np.full(1, 200.0), np.full(1, np.inf))
+    aims = panel.aims(law, panel.rests(ONE_MODE, cases, limits), cases)
+    run = panel.rolled_out(deployed(law, limits, integral_limit=1.0), cases, aims)
+    return run.y[:, cases.kind == "constant", 0]
+
+
+def test_a_plant_is_given_the_lag_that_it_does_not_hold():
+    """A model of one mode of 100 samples; with 2 samples of dead time; and one with a mode of 2 samples
+    beside, which leaves no room."""
+    rng, spread = np.random.default_rng, PlantSpread(0.0, 0.0, 0.0, 0.0, 0.0, lag=0.1)
+    dead = plant(
+        [[0.99, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]], [[0.0], [0.0], [0.01]], [[1.0, 0.0, 0.0]]
+    )
+    quick = plant([[0.99, 0.01], [0.0, 0.6]], [[0.0], [0.4]], [[1.0, 0.0]])
+
+    def lags(machine) -> np.ndarray:
+        drawn = panel.drawn([machine], 400, spread, cells=False, rng=rng(1))
+        kept = np.array([one.A[-1, -1] for one in drawn])
+        return np.array([-1 / np.log(k) if k else 0.0 for k in kept])
+
+    one, two, none = lags(ONE_MODE), lags(dead), lags(quick)
+    assert one.max() <= 9.95 and one.max() > 9.7 and (one[one > 0] >= 1).all()  # 0.1 / -ln 0.99
+    assert abs((one > 0).mean() - 0.9) < 0.05
+    np.testing.assert_allclose(two[one > 3.1], one[one > 3.1] - 2, rtol=1e-9)
+    assert not two[one < 3].any() and not none.any()
+
+
+def test_a_lag_is_drawn_apart_from_what_else_a_plant_differs_by():
+    without, lagged = (
+        panel.drawn([ONE_MODE], 20, SPREAD._replace(lag=lag), cells=False, rng=np.random.default_rng(3))
+        for lag in (0.0, 0.1)
+    )
+    for one, other in zip(without, lagged, strict=True):
+        assert one.A[0, 0] == other.A[0, 0] and one.b[0] == other.b[0]
+        np.testing.assert_allclose(one.A[0, 1:] + one.B[0], other.A[0, 1:] + other.B[0], rtol=1e-12)
+
+
 @pytest.fixture(scope="module")
 def drawn():
     return panel.drawn([baam()], 400, SPREAD, cells=True, rng=np.random.default_rng(1))

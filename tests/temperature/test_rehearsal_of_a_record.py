@@ -8,6 +8,7 @@ import pytest
 from pipeline.store import params
 from pipeline.temperature.controllers import baseline, governor
 from pipeline.temperature.controllers import law as laws
+from pipeline.temperature.plant import plant as linear
 from pipeline.temperature.plant import strictly_proper
 from pipeline.temperature.settings import Panel, Tracking, TuneWeights
 from pipeline.temperature.settings import Plant as Machine
@@ -63,6 +64,21 @@ def test_no_plant_starts_where_its_inputs_could_not_hold_it(family):
         after = judged.x0[rows] @ plant.A.T + judged.u0[rows] @ plant.B.T + plant.b
         # rounding of a solve with I - A, whose condition is some 1e4
         np.testing.assert_allclose(after, judged.x0[rows], rtol=1e-8, atol=1e-7)
+
+
+def test_both_halves_have_the_lag_that_a_model_of_one_mode_does_not_hold():
+    one = linear([[0.99]], [[0.01]], [[1.0]], b=[0.2])
+    of = rehearsal([one, one])
+    for half in (of.training, of.judging):
+        kept = np.array([each.A[-1, -1] for each in half.plants])
+        assert (kept > 0).sum() >= 3
+        # a twentieth of 100 samples, of a plant that is at most a fifth slower
+        assert kept.max() <= np.exp(-1 / (panel.LAG * 1.21 * 100))
+
+
+def test_the_machine_of_the_study_is_known_to_have_no_lag_in_series():
+    assert panel.spread_of(settings()).lag == 0.0
+    assert panel.spread_around(settings(), linear([[0.99]], [[0.01]], [[1.0]])).lag == panel.LAG
 
 
 def test_a_slow_bed_has_its_own_time_band_and_length(family):

@@ -100,6 +100,17 @@ def test_the_noise_is_that_of_the_sensor_and_its_converter(machine):
     assert (noise > 0.8 * expected).all() and (noise < 1.7 * expected).all()
 
 
+def test_a_model_that_is_far_off_makes_no_sensor_noisy():
+    """Its errors of one step are some 50 °C; the readings wander by 0.1 °C from one to the next."""
+    of = small_machines.identified(BED)
+    off = of.plant._replace(d=of.plant.d + 50.0, K=np.zeros_like(of.plant.K))
+    off = off._replace(A=0.5 * off.A)
+    noise = machine_scale([of.u], [of.y], off, BED.sample_time_s, [0]).noise_degC
+    expected = np.sqrt(np.mean(np.diff(of.y, axis=0) ** 2, axis=0))
+    np.testing.assert_allclose(noise, expected, rtol=1e-12)
+    assert (noise < 3 * scale_of(BED).noise_degC).all()
+
+
 def test_a_spike_of_a_sensor_widens_neither_range_nor_noise():
     of = small_machines.identified(HOT_END)
     y = of.y.copy()

@@ -2,7 +2,8 @@
 controller as it runs (law.py).
 
 Plants, drawn uniformly around a nominal one: each input's gain, the speed of the whole plant, more heat lost,
-a sample of delay on every input in a part of them, another ambient. Four in five have a structure that no
+a sample of delay on every input in a part of them, a lag before every input where the model is too slow to
+hold it, another ambient. Four in five have a structure that no
 controller's model holds beside that (STRUCTURES). Cases of each: constant references from several starts, the
 coldest first, a ramp, a sinusoid, a sequence of references, and a door, a fan and another room while a
 reference is held; sensor noise.
@@ -88,30 +89,38 @@ STRUCTURES = (
     Structure(step_degC=0.25, duty=0.01),
 )
 LATE, DEAD = 0.03, 3
+# the largest lag in series of a plant, as a share of its quickest mode of heat: a cartridge in its bore takes
+# 2 to 13 s, a sensor 1 to 5 s, a hot end that was identified as one mode 130 to 430 s
+LAG = 0.05
 
 
 class PlantSpread(NamedTuple):
     """How far plants lie from the nominal one: input gains 1 +- input_gain each; A' = I + (A - I) / (1 + d),
     B' = B / (1 + d), d within +- slower, in the modes of heat; A - l I, l from 0 to extra_heat_loss a step;
-    all inputs one step late in a share `delayed`; the ambient +- ambient_degC."""
+    all inputs one step late in a share `delayed`; the ambient +- ambient_degC; all inputs through a lag of 0
+    to `lag` times the plant's quickest time constant of heat, less what the plant holds: every heater in its
+    bore and every sensor has one, and a model that has no mode as quick does not hold it."""
 
     input_gain: float
     slower: float
     extra_heat_loss: float
     delayed: float
     ambient_degC: float
+    lag: float = 0.0
 
 
-def delayed(plant: Plant, late: bool) -> Plant:
-    """The plant with m more states, the input before: it acts a sample late, or is carried along unused, so
-    that both kinds have one order. Feed-through must be a delay already (plant.strictly_proper)."""
-    n, m = plant.n, plant.m
+def delayed(plant: Plant, late: bool, lag: float = 0.0) -> Plant:
+    """The plant with m more states h, the input before: it acts a sample late, or is carried along unused, so
+    that both kinds have one order. With a first-order lag of `lag` samples in series, no delay itself,
+    h' = k h + (1 - k) u with k = exp(-1 / lag) acts in place of u; one shorter than a sample is none.
+    Feed-through must be a delay already (plant.strictly_proper)."""
+    n, m, kept = plant.n, plant.m, np.exp(-1 / lag) if lag >= 1 else 0.0
     A, B = np.zeros((n + m, n + m)), np.zeros((n + m, m))
-    A[:n, :n], B[n:] = plant.A, np.eye(m)
+    A[:n, :n], A[n:, n:], B[n:] = plant.A, kept * np.eye(m), (1 - kept) * np.eye(m)
     if late:
         A[:n, n:] = plant.B
     else:
-        B[:n] = plant.B
+        A[:n, n:], B[:n] = kept * plant.B, (1 - kept) * plant.B
     return plant._replace(
         A=A,
         B=B,
@@ -122,18 +131,45 @@ def delayed(plant: Plant, late: bool) -> Plant:
 
 
 def varied(
-    plant: Plant, *, gains: np.ndarray, slower: float, loss: float, ambient: float, late: bool, cells: bool
+    plant: Plant,
+    *,
+    gains: np.ndarray,
+    slower: float,
+    loss: float,
+    ambient: float,
+    late: bool,
+    cells: bool,
+    lag: float = 0.0,
 ) -> Plant:
     """One plant of the spread. An ambient warmer by `ambient` °C warms every cell by as much in the end,
     where the states are `cells`, and every output otherwise. Of an identified plant only the modes of heat
-    slow down (`paced`)."""
+    slow down (`paced`). `lag` is a share of its quickest time constant of heat, of which what the
+    plant holds already is taken off."""
     identity = np.eye(plant.n)
     pace = identity / (1 + slower) if cells else paced(plant.A, slower)
     A = identity + pace @ (plant.A - identity)
     warmer = np.ones(plant.n) if cells else reached_state(plant) @ np.ones(plant.p)
     b = pace @ plant.b + (identity - A) @ warmer * ambient
     changed = plant._replace(A=A - loss * identity, B=pace @ plant.B * gains, b=b)
-    return delayed(changed, late)
+    whole = lag * quickest(changed.A)
+    return delayed(changed, late, whole - lag_held(changed, round(whole) + 2))
+
+
+def quickest(A: np.ndarray) -> float:
+    """The time constant in samples of the quickest mode of heat of A (n, n); 0 if none decays."""
+    sizes = [abs(value) for value in np.linalg.eigvals(A) if _of_heat(value)]
+    return float(-1 / np.log(min(sizes))) if sizes and min(sizes) < 1 else 0.0
+
+
+def lag_held(plant: Plant, samples: int) -> float:
+    """How many samples of lag and dead time a plant holds: what its response to a pulse misses of its peak
+    before that, sum (1 - h_k / h_peak) with h_k = sum |C A^k B|, k < samples."""
+    acting, response = plant.B, np.empty(samples)
+    for k in range(samples):
+        response[k] = np.abs(plant.C @ acting).sum()
+        acting = plant.A @ acting
+    peak = int(response.argmax())
+    return float(np.sum(1 - response[:peak] / response[peak]))
 
 
 def paced(A: np.ndarray, slower: float) -> np.ndarray:
@@ -165,7 +201,7 @@ def drawn(
     nominal: Sequence[Plant], count: int, spread: PlantSpread, *, cells: bool, rng: np.random.Generator
 ) -> list[Plant]:
     """`count` plants around the nominal ones in turn."""
-    plants = []
+    plants, lags = [], rng.spawn(1)[0].uniform(0, spread.lag, count)
     for k in range(count):
         plant = nominal[k % len(nominal)]
         gains = 1 + spread.input_gain * rng.uniform(-1, 1, plant.m)
@@ -179,6 +215,7 @@ def drawn(
                 ambient=spread.ambient_degC * ambient,
                 late=late < spread.delayed,
                 cells=cells,
+                lag=lags[k],
             )
         )
     return plants
@@ -367,13 +404,8 @@ def carrying(plant: Plant) -> np.ndarray:
 def _undelayed(plant: Plant) -> Plant:
     """The plant of `delayed` without the inputs that it carries along."""
     n = plant.n - plant.m
-    late = np.any(plant.A[:n, n:])
     return plant._replace(
-        A=plant.A[:n, :n],
-        B=plant.A[:n, n:] if late else plant.B[:n],
-        C=plant.C[:, :n],
-        b=plant.b[:n],
-        K=plant.K[:n],
+        A=plant.A[:n, :n], B=plant.A[:n, n:] + plant.B[:n], C=plant.C[:, :n], b=plant.b[:n], K=plant.K[:n]
     )
 
 
@@ -789,9 +821,12 @@ def spread_of(settings: Panel) -> PlantSpread:
 
 
 def spread_around(settings: Panel, identified: Plant) -> PlantSpread:
-    """The declared spread, with no more heat lost than is little beside what somebody's machine loses."""
+    """The declared spread, with no more heat lost than is little beside what somebody's machine loses, and
+    with a lag, which the study's machine is known not to have."""
     spread, slowest = spread_of(settings), 1 - np.abs(np.linalg.eigvals(identified.A)).max()
-    return spread._replace(extra_heat_loss=float(np.clip(0.2 * slowest, 0.0, spread.extra_heat_loss)))
+    return spread._replace(
+        extra_heat_loss=float(np.clip(0.2 * slowest, 0.0, spread.extra_heat_loss)), lag=LAG
+    )
 
 
 def from_declaration(settings: Panel, machine: Machine, truth: Plant, family: Sequence[Plant]) -> Rehearsal:

@@ -47,8 +47,9 @@ class MachineScale(NamedTuple):
 
     time_constant_s: the first-order lag that explains the record; delay_s: effective dead time of the
     strongest input, lags of sensors in it. low_degC..high_degC: recorded range. noise_degC: standard
-    deviation of what one step cannot foretell. ambient_degC_spread: the largest difference of the mean error
-    of simulation between recordings, 0 with one: another room, another day.
+    deviation of what one step cannot foretell, neither by the model nor by the reading before.
+    ambient_degC_spread: the largest difference of the mean error of simulation between recordings, 0 with
+    one: another room, another day.
     """
 
     time_constant_s: np.ndarray
@@ -110,15 +111,16 @@ def machine_scale(
     p = model.p
     longest = max(map(len, y)) * sample_time_s
     taus = [time_constant(u, [b[:, o] for b in y], sample_time_s=sample_time_s) for o in range(p)]
-    rows = np.vstack(y)
-    low, high = np.nanquantile(rows, RANGE, axis=0)
+    low, high = np.nanquantile(np.vstack(y), RANGE, axis=0)
     below, above = np.nanquantile(np.vstack(one_step_errors(model, u, y)), ONE_DEVIATION, axis=0)
+    # larger errors than those of the reading before are faults of the model, no noise of a sensor
+    repeated = np.sqrt(np.nanmean(np.vstack([np.diff(b, axis=0) for b in y]) ** 2, axis=0))
     return MachineScale(
         np.minimum(taus, longest),
         sample_time_s * _delays(model, np.ptp(np.vstack(u), axis=0), max(map(len, y))),
         low,
         high,
-        (above - below) / 2,
+        np.minimum((above - below) / 2, repeated),
         _ambient_spread(u, y, model, recording_of_segment),
     )
 
