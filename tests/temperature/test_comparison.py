@@ -125,6 +125,20 @@ def test_a_difference_that_the_structure_of_a_machine_turns_round_is_none_that_a
     assert not turned["kept"] and turned["winner"] is None
 
 
+def test_a_difference_beyond_the_deviation_over_structures_is_kept_and_one_within_is_not():
+    structure = PLANT % 5
+    a, b = costs(1, own=0.01), costs(1, own=0.01)
+    for shares, kept in (
+        # by structure 15, 10, 7, 5 and 1 %: 7.6 on the whole, deviation 5.3, range 14
+        ([0.85, 0.9, 0.93, 0.95, 0.99], True),
+        # 15, 10, 3, 0 and -5 %: 4.6 on the whole, deviation 7.9
+        ([0.85, 0.9, 0.97, 1.0, 1.05], False),
+    ):
+        of = pair("a", "b", {"a": a, "b": np.array(shares)[structure] * b}, PLANT, structure, seed=1)
+        np.testing.assert_allclose(of["by_structure"], 100 * (1 - np.array(shares)), atol=1e-6)
+        assert of["p"] < 0.05 and of["kept"] == kept and of["winner"] == ("b" if kept else None)
+
+
 def test_of_two_alike_one_wins_in_one_of_twenty_panels_and_the_interval_holds_zero_in_nine_of_ten():
     """Over 400 panels: 0.011 is a standard deviation of the first, 0.015 of the second; the difference is
     that of the cheaper one, so that only its lower end can miss zero, at either side."""

@@ -65,10 +65,10 @@ FIXED = {
         "The pair",
         "The model-based contestant against the data-driven one, tuned with the same budget and cost, on the "
         "same plants: a paired test over plants. Each kind is stood for by the one that tuning found "
-        "cheapest on the training plants. A difference counts only if it is larger than its range over "
-        "structures of machines: then another machine would keep it. The percentage is of the typical ratio "
-        "of their costs (geometric mean, every case counts alike); the 90 % quantiles of the table are of "
-        "the dear cases.",
+        "cheapest on the training plants. A difference counts only if it is larger than its standard "
+        "deviation over structures of machines: another structure would then keep its sign in four of five. "
+        "The percentage is of the typical ratio of their costs (geometric mean, every case counts alike); "
+        "the 90 % quantiles of the table are of the dear cases.",
     ),
     "crossings": (
         "Crossings",
