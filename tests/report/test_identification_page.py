@@ -239,6 +239,19 @@ def test_poles_are_listed_with_their_time_constants_and_those_not_found_again_ar
     assert "0.9000 9.49 s" in text
 
 
+@pytest.mark.parametrize(
+    ("C", "rank", "samples"), [([[1.0, 0.0]], 2, 2), ([[0.0, 1.0]], 1, 1), (np.eye(2), 2, 1)]
+)
+def test_what_the_outputs_show_of_the_states_is_the_rank_of_the_observability_matrix(C, rank, samples):
+    plant = {"A": np.array([[[0.9, 1.0], [0.0, 0.8]]]), "C": np.array([C])}
+    assert pictures.states_seen(plant) == {"rank": rank, "of": 2, "samples": samples}
+    assert pictures.states_seen(None) is None
+
+
+def test_the_page_says_whether_the_model_is_observable(project):
+    assert re.search(r"The outputs show (\d) of (\d) states within \d samples?: (not )?observable", page())
+
+
 def test_advice_and_the_remedies_that_it_does_not_speak_of_stand_under_what_to_do(project):
     change("identify_plant", largest_pole=1.001, notes=["12 rows touch a masked sample"])
     text = page()

@@ -13,6 +13,7 @@ from pipeline.report.identification.how_identified import MOST_INPUTS, left_out_
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
 from pipeline.report.shared.sources import Sources
+from pipeline.temperature.plant import observability_matrix
 from pipeline.verdict.digits import THIN, band, count, decimals, number, short
 from pipeline.verdict.evidence import Table, entry, known, lookup, need, need_figure
 from pipeline.verdict.identification import Fit, percent_of
@@ -426,7 +427,8 @@ def order(sources: Sources) -> dict[str, Any]:
 @as_matrix("poles", "Poles, and how surely they are known")
 def poles(sources: Sources) -> dict[str, Any]:
     """Each pole of the model, a pair in one row: size, time constant with its 90 % band over the spread, and
-    period in s; how many poles and plants there are, the largest size, and the bandwidth."""
+    period in s; how many poles and plants there are, the largest size, the bandwidth, and what the sensors
+    see of the states."""
     table, step = pd.DataFrame(need(sources.tables["poles"])), sources.declared.machine.sample_time_s
     table["size"] = np.hypot(table["real"], table["imag"])
     table["constant_s"] = [_constant(size, step) for size in table["size"]]
@@ -443,8 +445,21 @@ def poles(sources: Sources) -> dict[str, Any]:
         "largest": float(model["size"].max()),
         "plants": int(table.member.max()),
         "bandwidth": entry(sources.metrics["identify_plant"], "bandwidth_rad_s"),
+        "seen": states_seen(known(sources.tables["plant"], None)),
         "origin": page.origin(sources.source("poles")),
     }
+
+
+def states_seen(plant: Table | None) -> dict[str, int] | None:
+    """The rank of the observability matrix [C; CA; ...] of a plant stored as A (1, n, n) and C (1, p, n), n,
+    and the samples in a row that reach that rank."""
+    if plant is None:
+        return None
+    A, C = (np.asarray(plant[name], float)[0] for name in "AC")
+    ranks = [
+        int(np.linalg.matrix_rank(observability_matrix(A, C, blocks))) for blocks in range(1, len(A) + 1)
+    ]
+    return {"rank": ranks[-1], "of": len(A), "samples": ranks.index(ranks[-1]) + 1}
 
 
 def _constant(size: float, step: float) -> float:

@@ -43,7 +43,9 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
                 "paper": paper,
                 "brief": brief(paper),
                 "rows": paper.rows,
-                "pictures": pictures(key, paper.results, tables),
+                "pictures": pictures(
+                    key, paper.results, tables, [mark for row in paper.rows for mark in row.marks]
+                ),
                 "files": (printed, results),
                 "made": " ".join(
                     made.sentence(one) for one in (key, *filter(made.changed, PARTS.get(key, ())))
@@ -91,9 +93,11 @@ def decision(papers: Sequence[Paper]) -> str:
     if not rows:
         return "No paper is set beside us: the results are not there."
     holds, shape, fails, opened = (sum(paper.count(verdict) for paper in papers) for verdict in VERDICTS)
+    mended = sum(paper.mended() for paper in papers)
     return (
         f"Of {rows} tables, figures and numbers of the papers {holds} hold, {shape} hold in shape, "
-        f"{fails} do not hold, and {opened} cannot be judged."
+        f"{fails} do not hold, {mended} of which do with a change that is named, and {opened} cannot be "
+        "judged."
     )
 
 
