@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.deposition.learning.ilc import Trial
+from pipeline.papers import camera as papers_camera
 from pipeline.papers import deposition as papers_deposition
 from pipeline.papers import published, search_agent, train_agent
 from pipeline.papers import setpoint as papers_setpoint
@@ -175,6 +176,11 @@ def test_a_change_mends_a_row_only_if_the_rows_own_rule_holds_with_it():
 )
 def test_a_mark_stands_where_the_paper_prints_the_value(mark, printed, marks):
     assert made(1, rule="not_judged", printed=printed, mark=mark).marks == marks
+
+
+def test_a_value_that_the_paper_prints_without_a_place_is_a_line():
+    ((figure, panel, x, y),) = made(1, rule="not_judged", printed=75, mark={"panel": 2}).marks
+    assert (figure, panel, y) == ("Figure 1", 2, 75) and np.isnan(x)
 
 
 @pytest.mark.parametrize("name", SEEDS)
@@ -498,3 +504,21 @@ def test_the_nearest_draw_has_the_figures_that_it_is_said_to_have(monkeypatch):
     assert found["all"] == 0 or found["nearest_has"] == 4
     for name, is_near in zip(printed, near, strict=True):
         assert not is_near or found["percent"][name] > 0
+
+
+@pytest.mark.parametrize(("right_of_adr", "helping"), [(range(8), 16), ([*range(1, 5), 6], 0)])
+def test_adr_helps_only_if_it_gains_more_than_chance_over_segments(monkeypatch, right_of_adr, helping):
+    """Eight segments of five pictures; a network is here the segments that it names right."""
+    pictures = np.zeros((40, len(papers_camera.SHAKES_PX), 16, 48), np.uint8)
+    segment, label = np.repeat(np.arange(8), 5), np.ones(40, int)
+    truth = (np.full(40, 210.0), label, np.full(40, 100.0), segment)
+    judged = papers_camera.Filmed(pictures[:, 0], pictures[:, 0], pictures, truth)
+    none, adr = list(range(4)), list(right_of_adr)
+    learned = {papers_camera.unchanged: none}
+    monkeypatch.setattr(papers_camera, "learned", lambda parts, name, way, epochs: learned.get(way, adr))
+    monkeypatch.setattr(
+        papers_camera, "named", lambda network, seen: np.isin(seen.segment, network).astype(int)
+    )
+    found = papers_camera.robustness([judged] * 3, {"mask": none, "mask_adr": adr})
+    assert (found["ways"], found["helping"], found["helps"]) == (16, helping, helping > 0)
+    assert found["best"]["gains"] == pytest.approx(100 * len(adr) / 8 - 50)

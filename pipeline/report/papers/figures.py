@@ -97,7 +97,8 @@ def plot(
         pairs = zip(itertools.cycle(xs), ys, strict=False)
         curves += [(x, y / panel.get("per", 1), css, name) for x, y in pairs]
     crosses = [(x, y / panel.get("per", 1)) for x, y in crosses]
-    ends = [float(bound(x)) for x, *_ in curves for bound in (np.min, np.max)] + [x for x, _ in crosses]
+    ends = [float(bound(x)) for x, *_ in curves for bound in (np.min, np.max)]
+    ends += [x for x, _ in crosses if not np.isnan(x)]
     values = np.concatenate([*(y for _, y, *_ in curves), [y for _, y in crosses]])
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     known = {**context, "high": high}
@@ -137,6 +138,8 @@ def plot(
 
 
 def cross(frame: charts.Frame, x: float, y: float) -> Markup:
-    """The mark of a value that the paper prints."""
+    """The mark of a value that the paper prints; a line if it does not print where."""
+    if np.isnan(x):
+        return charts.level(frame, y, "printed")
     across, up = (float(at(value)) for at, value in ((frame.px, x), (frame.py, y)))
     return Markup('<path class="printed" d="M{:.1f} {:.1f}h12m-6-6v12"/>').format(across - 6, up)

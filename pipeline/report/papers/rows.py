@@ -131,12 +131,13 @@ def _row(one: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -
 
 
 def _marks(one: Mapping[str, Any]) -> list[tuple[str, int, float, float]]:
-    """Where its `mark` draws what a row prints: at x of a panel of its figure, or at y; one, or one each."""
-    if not (mark := one.get("mark")):
+    """Where its `mark` draws what a row prints: at x of a panel of its figure, one or one each, or at y; x is
+    NaN if the paper does not print where."""
+    if (mark := one.get("mark")) is None:
         return []
     printed = _list(one["printed"])
-    other = _list(mark["x" if "x" in mark else "y"]) * (1 if len(printed) == 1 else len(printed))
-    pairs = [(a, b) if "x" in mark else (b, a) for a, b in zip(other, printed, strict=False)]
+    other = _list(mark.get("y", mark.get("x", math.nan))) * len(printed)
+    pairs = [(a, b) if "y" in mark else (b, a) for a, b in zip(printed, other, strict=False)]
     return [(mark.get("figure", one["at"]), mark.get("panel", 0), *pair) for pair in pairs]
 
 
