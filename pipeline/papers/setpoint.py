@@ -97,10 +97,11 @@ def measure(q: np.ndarray, u: np.ndarray) -> dict[str, float | None]:
     """Medians of runs (n, steps + 1): those of claims.measure_runs; where the temperature rests, its least,
     and its least after it first came within 2 °C of the best."""
     came = np.maximum.accumulate(np.abs(u - BEST_TEMPERATURE) <= 2.0, axis=1)
+    dips = np.where(came, u, np.inf).min(axis=1)[came.any(axis=1)]
     return claims.measure_runs(q, u) | {
         "rests_at_degC": float(np.median(u[:, -claims.RESTING :].mean(axis=1))),
         "least_degC": float(np.median(u.min(axis=1))),
-        "dips_to_degC": float(np.median(np.where(came, u, np.inf).min(axis=1))) if came.any() else None,
+        "dips_to_degC": float(np.median(dips)) if len(dips) else None,
     }
 
 

@@ -13,7 +13,6 @@ from pipeline.report.identification.how_identified import MOST_INPUTS, left_out_
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, as_table
 from pipeline.report.shared.sources import Sources
-from pipeline.temperature.plant import observability_matrix
 from pipeline.verdict.digits import THIN, band, count, decimals, number, short
 from pipeline.verdict.evidence import Table, entry, known, lookup, need, need_figure
 from pipeline.verdict.identification import Fit, percent_of
@@ -456,9 +455,9 @@ def states_seen(plant: Table | None) -> dict[str, int] | None:
     if plant is None:
         return None
     A, C = (np.asarray(plant[name], float)[0] for name in "AC")
-    ranks = [
-        int(np.linalg.matrix_rank(observability_matrix(A, C, blocks))) for blocks in range(1, len(A) + 1)
-    ]
+    rows = np.cumsum([len(C)] * len(A))
+    blocks = np.vstack([C @ np.linalg.matrix_power(A, i) for i in range(len(A))])
+    ranks = [int(np.linalg.matrix_rank(blocks[:count])) for count in rows]
     return {"rank": ranks[-1], "of": len(A), "samples": ranks.index(ranks[-1]) + 1}
 
 
