@@ -146,7 +146,7 @@ def short_phases(how: agent.PublishedTraining) -> dict[str, Any]:
     """Figure 7 (a) to (d) after shorter phases, whose length the paper does not print: of phase 1 the ranges
     of flow and temperature over the second half of the run, of phase 2 from each of these the same. How many
     do as is told, and the figures of the first that does in both phases."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for seed, first in itertools.product(TRIED_SEEDS, TRIED_UPDATES[0]):
         train_state, key = agent.begin_published(first_key(seed), how)
         train_state, before = shortened(train_state, key, how, 0, first)
@@ -173,7 +173,7 @@ def shortened(
     train_state = agent.published_phase(train_state, key, how._replace(updates=lengths), i).train_state
     path = claims.run_start(train_state.network, *SINGLE["figure_7"], accuracy=1.0)  # ty: ignore[invalid-argument-type]
     told = claims.measure_runs(np.asarray(path.flow, float), np.asarray(path.temperature, float))
-    return train_state, [told["flow_range"], told["temperature_range"]]  # ty: ignore[invalid-return-type]
+    return train_state, [told["flow_range"], told["temperature_range"]]  # ty: ignore[invalid-explicit-return]
 
 
 def starts(network: agent.QNetwork, accuracy: float) -> dict[str, Any]:

@@ -115,7 +115,7 @@ def _row(one: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -
         printed, shown = f"{len(entries)} entries", f"{agree} of {len(entries)} as printed"
     else:
         shown = _shown(ours, unit, one.get("ours_places", places))
-    changed = _ours(one | {"ours": one.get("changed")}, found, metrics, place)
+    changed = _ours({**one, "ours": one.get("changed")}, found, metrics, place)
     return PaperRow(
         one["at"],
         one["what"],
