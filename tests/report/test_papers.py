@@ -247,9 +247,8 @@ def test_the_page_shows_every_row_of_every_paper_and_counts_them():
     counts = [sum(paper.count(verdict) for paper in papers) for verdict in VERDICTS]
     mended = sum(row.verdict == FAILS and row.mended for paper in papers for row in paper.rows)
     assert page.decision(papers) == (
-        f"Of {sum(counts)} tables, figures and numbers of the papers {counts[0]} hold, {counts[1]} hold in "
-        f"shape, {counts[2]} do not hold, {mended} of which do with a change that is named, and {counts[3]} "
-        "cannot be judged."
+        f"Of {sum(counts)} tables, figures and numbers {counts[0]} hold, {counts[1]} in shape, {mended} only "
+        f"with a named change, {counts[2] - mended} do not; {counts[3]} cannot be judged."
     )
     assert page.decision(papers) in text
     labels = re.findall(r'role="img" aria-label="([^"]*)"', text)

@@ -59,14 +59,9 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
         sources=sources,
         title="Three papers beside us",
         decision=decision(papers),
-        verdicts=VERDICTS,
+        verdicts=(HOLDS, SHAPE, "only with a change", FAILS, OPEN),
         counts=[
-            {
-                "key": paper.key,
-                "title": paper.title,
-                "rows": len(paper.rows),
-                "counts": [paper.count(verdict) for verdict in VERDICTS],
-            }
+            {"key": paper.key, "title": paper.title, "rows": len(paper.rows), "counts": counts(paper)}
             for paper in papers
         ],
         papers=shown,
@@ -92,13 +87,18 @@ def decision(papers: Sequence[Paper]) -> str:
     rows = sum(len(paper.rows) for paper in papers)
     if not rows:
         return "No paper is set beside us: the results are not there."
-    holds, shape, fails, opened = (sum(paper.count(verdict) for paper in papers) for verdict in VERDICTS)
-    mended = sum(paper.mended() for paper in papers)
+    holds, shape, mended, fails, opened = (sum(column) for column in zip(*map(counts, papers), strict=True))
     return (
-        f"Of {rows} tables, figures and numbers of the papers {holds} hold, {shape} hold in shape, "
-        f"{fails} do not hold, {mended} of which do with a change that is named, and {opened} cannot be "
-        "judged."
+        f"Of {rows} tables, figures and numbers {holds} hold, {shape} in shape, {mended} only with a named "
+        f"change, {fails} do not; {opened} cannot be judged."
     )
+
+
+def counts(paper: Paper) -> list[int]:
+    """How many rows hold, hold in shape, hold only with the change that they name, do not hold, and cannot be
+    judged."""
+    holds, shape, fails, opened = (paper.count(verdict) for verdict in VERDICTS)
+    return [holds, shape, paper.mended(), fails - paper.mended(), opened]
 
 
 def brief(paper: Paper) -> list[tuple[str, list[str]]]:
