@@ -455,9 +455,8 @@ def states_seen(plant: Table | None) -> dict[str, int] | None:
     if plant is None:
         return None
     A, C = (np.asarray(plant[name], float)[0] for name in "AC")
-    rows = np.cumsum([len(C)] * len(A))
-    blocks = np.vstack([C @ np.linalg.matrix_power(A, i) for i in range(len(A))])
-    ranks = [int(np.linalg.matrix_rank(blocks[:count])) for count in rows]
+    matrix = np.vstack([C @ np.linalg.matrix_power(A, i) for i in range(len(A))])
+    ranks = [int(np.linalg.matrix_rank(matrix[: len(C) * blocks])) for blocks in range(1, len(A) + 1)]
     return {"rank": ranks[-1], "of": len(A), "samples": ranks.index(ranks[-1]) + 1}
 
 

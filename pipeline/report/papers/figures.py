@@ -97,12 +97,14 @@ def plot(
         pairs = zip(itertools.cycle(xs), ys, strict=False)
         curves += [(x, y / panel.get("per", 1), css, name) for x, y in pairs]
     crosses = [(x, y / panel.get("per", 1)) for x, y in crosses]
-    ends = [float(bound(x)) for x, *_ in curves for bound in (np.min, np.max)]
-    ends += [x for x, _ in crosses if not np.isnan(x)]
+    ends = [float(end) for x, *_ in curves for end in (np.min(x), np.max(x))] + [
+        x for x, _ in crosses if not np.isnan(x)
+    ]
     values = np.concatenate([*(y for _, y, *_ in curves), [y for _, y in crosses]])
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    known = {**context, "high": high}
-    across, up = (_value(panel[key], known) if key in panel else None for key in ("across", "up"))
+    across, up = (
+        _value(panel[key], {**context, "high": high}) if key in panel else None for key in ("across", "up")
+    )
     frame = charts.Frame(
         across or charts.linear(min(ends), max(ends)),
         up or axis(low, high),

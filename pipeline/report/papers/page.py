@@ -41,7 +41,6 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
             {
                 "key": key,
                 "paper": paper,
-                "brief": brief(paper),
                 "rows": paper.rows,
                 "pictures": pictures(
                     key, paper.results, tables, [mark for row in paper.rows for mark in row.marks]
@@ -84,13 +83,12 @@ def _results(path: str, stage: str) -> dict[str, Any]:
 
 def decision(papers: Sequence[Paper]) -> str:
     """What all papers come to, in a sentence."""
-    rows = sum(len(paper.rows) for paper in papers)
-    if not rows:
+    if not papers:
         return "No paper is set beside us: the results are not there."
     holds, shape, mended, fails, opened = (sum(column) for column in zip(*map(counts, papers), strict=True))
     return (
-        f"Of {rows} tables, figures and numbers {holds} hold, {shape} in shape, {mended} only with a named "
-        f"change, {fails} do not; {opened} cannot be judged."
+        f"Of {holds + shape + mended + fails + opened} tables, figures and numbers {holds} hold, {shape} in "
+        f"shape, {mended} only with a named change, {fails} do not; {opened} cannot be judged."
     )
 
 
@@ -99,9 +97,3 @@ def counts(paper: Paper) -> list[int]:
     judged."""
     holds, shape, fails, opened = (paper.count(verdict) for verdict in VERDICTS)
     return [holds, shape, paper.mended(), fails - paper.mended(), opened]
-
-
-def brief(paper: Paper) -> list[tuple[str, list[str]]]:
-    """The places of the rows that do not hold, and of those that cannot be judged, each once."""
-    places = {verdict: [row.at for row in paper.rows if row.verdict == verdict] for verdict in (FAILS, OPEN)}
-    return [(verdict, list(dict.fromkeys(at))) for verdict, at in places.items() if at]
