@@ -237,7 +237,7 @@ def test_another_count_of_the_papers_makes_the_readme_wrong(root, text, accepted
             name = f"{key}.{suffix}"
             (tmp_path / name).write_bytes((root / readme.PAPERS / name).read_bytes())
     figures = artifacts.read_json(tmp_path / "temperature.json")
-    figures["model_based"]["identity"]["J100"] += 100.0
+    figures["model_based"]["identity"]["farthest"] += 1.0
     artifacts.write_json(tmp_path / "temperature.json", figures)
     with pytest.raises(AssertionError, match="README.md, block papers"):
         check_readme(text, accepted, tmp_path)

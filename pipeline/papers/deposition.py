@@ -2,8 +2,9 @@
 and the same law on a machine that is not its model.
 
 `./run dvc repro datasets/papers/dvc.yaml:deposition` writes datasets/papers/deposition.json, which
-reports/papers.html shows; seconds. The paper prints neither lengths nor speeds of its training routine: ours
-is that of tests/deposition, a pulse of two plateaus with a pause of 0.6 s between them, at 50 Hz.
+reports/papers.html shows; half a minute. The paper prints neither lengths nor speeds of its training routine:
+ours is a pulse of two plateaus with a pause of 0.6 s between them, at 50 Hz, one for all figures. Errors are
+in its unit, measured flow a mm of travel, while the gantry moves.
 """
 
 from collections.abc import Sequence
@@ -25,13 +26,16 @@ from pipeline.papers import files
 
 COMMAND = "./run dvc repro datasets/papers/dvc.yaml:deposition"
 TRIALS, SHOWN = 31, (0, 15, 30)  # figure 3 shows these, figure 5 the command of the last
+LATE = 120  # trials after which a law that a delay makes diverge has done so
 PAUSE_S, RAMP_S = 0.6, 0.15
 # slower ramps, tried for what the paper prints of the effort of B over that of A
-RAMPS_S = (0.5, 1.0, 1.5, 2.0, 4.0)
+RAMPS_S = np.arange(20, 201) / 100
 PRINTED_EFFORT = 1.5
 DELAYS_S = (0.0, 0.1, 0.15)
-# plateaus of 14 s are three time constants of B: those of 6 s are too short to cut a library from
-ON_S, LIBRARY_ON_S = 6.0, 14.0
+# three time constants of B: plateaus of 6 s are too short to cut a library from
+ON_S = 14.0
+# share of the full speed from which flow a mm of travel is told: at rest there is none
+MOVES = 0.05
 # the paper's machines A and B, its law (2), and the noise of a measured trial
 TS, AREA, SPEED, NOZZLE = 0.02, 0.304, 8.0, 0.6
 STEADY_FLOW = AREA * SPEED
@@ -84,17 +88,19 @@ def causal_q(x: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: floa
     return scipy.signal.sosfilt(scipy.signal.butter(order, cutoff_hz, fs=1 / sample_time_s, output="sos"), x)
 
 
-def trained(on_s: float, ramp_s: float = RAMP_S) -> Routine:
+def trained(ramp_s: float = RAMP_S) -> Routine:
     """The training routine: off, on, pause, on, off; ramps of more than RAMP_S make it longer."""
     more = ramp_s - RAMP_S
     return routine(
-        off_s=4 + more, on_s=on_s + 2 * more, pause_s=PAUSE_S, tail_s=8 + more, speed=SPEED,
+        off_s=4 + more, on_s=ON_S + 2 * more, pause_s=PAUSE_S, tail_s=8 + more, speed=SPEED,
         bead_area_mm2=AREA, ramp_s=ramp_s, sample_time_s=TS,
     )  # fmt: skip
 
 
-def learned(plant: Extruder, nominal: Extruder, r: np.ndarray, q=ilc.zero_phase) -> list[ilc.Trial]:
-    """TRIALS updates of the paper's law (2) from on-off control, the drive without limits, no roll-back."""
+def learned(
+    plant: Extruder, nominal: Extruder, r: np.ndarray, q=ilc.zero_phase, trials: int = TRIALS
+) -> list[ilc.Trial]:
+    """So many updates of the paper's law (2) from on-off control, the drive without limits, no roll-back."""
     rng = np.random.default_rng(0)
     law = ilc.hoelzle_law(r, nominal, q, HOELZLE, drive=UNLIMITED, sample_time_s=TS)
 
@@ -102,12 +108,15 @@ def learned(plant: Extruder, nominal: Extruder, r: np.ndarray, q=ilc.zero_phase)
         y = flow(plant, u, sample_time_s=TS)
         return ilc.Trial(u, disturb(y, rng, steady_flow=STEADY_FLOW, **NOISE), y)
 
-    return ilc.learn(law, measure, r / nominal.gain, r, trials=TRIALS, rise=NO_ROLL_BACK)
+    return ilc.learn(law, measure, r / nominal.gain, r, trials=trials, rise=NO_ROLL_BACK)
 
 
-def ratios(trials: list[ilc.Trial], r: np.ndarray) -> list[float]:
-    """R.m.s. error of the true flow in percent of trial 0's."""
-    errors = [float(np.sqrt(np.mean((trial.truth - r) ** 2))) for trial in trials]
+def ratios(trials: list[ilc.Trial], task: Routine) -> list[float]:
+    """R.m.s. error of the measured flow in mm³ a mm of travel, in percent of trial 0's."""
+    moves = task.speed > MOVES * task.speed.max()
+    errors = [
+        float(np.sqrt(np.mean(((trial.y - task.r)[moves] / task.speed[moves]) ** 2))) for trial in trials
+    ]
     return [100 * error / errors[0] for error in errors]
 
 
@@ -120,11 +129,10 @@ def learning(task: Routine) -> dict[str, Any]:
     """Figures 3 to 5: A and B on their nominal machines, A with delays that the model lacks, and with a Q
     that runs forward only."""
     out: dict[str, Any] = {"time_s": thinned(task.time_s, digits=2), "wanted": thinned(task.r / STEADY_FLOW)}
-    printing, commands = task.r > 0, {}
+    printing = task.r > 0
     for name, nominal in MATERIALS.items():
         trials = learned(nominal, nominal, task.r)
-        ratio, u = ratios(trials, task.r), trials[TRIALS].u
-        commands[name] = u
+        ratio, u = ratios(trials, task), trials[TRIALS].u
         out[name] = {
             "flow": {f"trial_{j}": thinned(np.asarray(trials[j].truth) / STEADY_FLOW) for j in SHOWN},
             "ratio": [round(value, 3) for value in ratio],
@@ -137,33 +145,34 @@ def learning(task: Routine) -> dict[str, Any]:
             "rms_mm": float(np.sqrt(np.mean(u[printing] ** 2))),
         }
     delayed = MATERIALS["A"]
-    out["delays"] = {
-        f"delay_{round(1000 * delay)}_ms": [
-            round(value, 3)
-            for value in ratios(learned(delayed._replace(delay_s=delay), delayed, task.r), task.r)
-        ]
+    late = {
+        f"delay_{round(1000 * delay)}_ms": ratios(
+            learned(delayed._replace(delay_s=delay), delayed, task.r, trials=LATE), task
+        )
         for delay in DELAYS_S
     }
+    out["delays"] = {name: [round(value, 3) for value in rows[: TRIALS + 1]] for name, rows in late.items()}
+    out["late"] = {name: rows[-1] for name, rows in late.items()}
     out["gamma"] = {f"delay_{round(1000 * delay)}_ms": convergence(delay) for delay in DELAYS_S}
-    out["late"] = {name: rows[-1] for name, rows in out["delays"].items()}
-    out["causal_best"] = min(ratios(learned(delayed, delayed, task.r, causal_q), task.r))
+    out["causal_best"] = min(ratios(learned(delayed, delayed, task.r, causal_q), task))
     out["effort"] = {
         f"{key}_ratio": out["B"][f"{key}_mm"] / out["A"][f"{key}_mm"] for key in ("steady", "rms", "peak")
-    } | slower_ramps(out["B"]["rms_mm"] / out["A"]["rms_mm"])
-    out["excursion_ratio"] = float(np.ptp(commands["B"]) / np.ptp(commands["A"]))
+    } | slower_ramps()
     return out
 
 
-def slower_ramps(rms_ratio: float) -> dict[str, float]:
-    """The paper does not print its ramps. The ramp in s of RAMPS_S with which the r.m.s. command of B over
-    that of A while printing is nearest to what it prints, and that ratio; `rms_ratio` is that of RAMP_S."""
-    ratio = {RAMP_S: rms_ratio}
+def slower_ramps() -> dict[str, float]:
+    """The paper does not print its ramps. The first of RAMPS_S with which the r.m.s. command of B over that
+    of A while printing is what it prints, to a hundredth; that ratio, and the least errors with it."""
     for ramp_s in RAMPS_S:
-        task = trained(ON_S, ramp_s)
-        A, B = (learned(one, one, task.r)[TRIALS].u[task.r > 0] for one in MATERIALS.values())
-        ratio[ramp_s] = float(np.linalg.norm(B) / np.linalg.norm(A))
-    nearest = min(ratio, key=lambda ramp_s: abs(ratio[ramp_s] - PRINTED_EFFORT))
-    return {"ramp_s": RAMP_S, "nearest_ramp_s": nearest, "nearest_ratio": ratio[nearest]}
+        task = trained(float(ramp_s))
+        trials = {name: learned(one, one, task.r) for name, one in MATERIALS.items()}
+        A, B = (of[TRIALS].u[task.r > 0] for of in trials.values())
+        ratio = float(np.linalg.norm(B) / np.linalg.norm(A))
+        if abs(ratio - PRINTED_EFFORT) < 0.005:
+            best = {f"changed_best_{name}": min(ratios(of, task)) for name, of in trials.items()}
+            return {"ramp_s": RAMP_S, "changed_ramp_s": float(ramp_s), "changed_ratio": ratio, **best}
+    raise RuntimeError("slower_ramps: no ramp gives the printed effort; try others")
 
 
 def convergence(delay_s: float) -> float:
@@ -276,15 +285,15 @@ def table_1() -> dict[str, Any]:
         "order": HOELZLE.order,
         "hierarchy": list(TASKS),
         "plateau_s": ON_S,
-        "library_plateau_s": LIBRARY_ON_S,
         "pause_s": PAUSE_S,
         "rate_hz": 1 / TS,
         "delays_ms": [1000 * delay for delay in DELAYS_S],
+        "late": LATE,
     }
 
 
 def main() -> None:
-    task = trained(LIBRARY_ON_S)
+    task = trained()
     known, cut = library(task)
     figure_9 = composed(known, Path("datasets/parts/fig9.gcode"), {0: "A"}, curves=True)
     parts = {
@@ -294,7 +303,7 @@ def main() -> None:
     parts = {name: composed(known, path, {0: "A", 1: "B"}, curves=False) for name, path in parts.items()}
     result = {
         "command": COMMAND,
-        "learning": learning(trained(ON_S)),
+        "learning": learning(task),
         "library": cut,
         "figure_9": figure_9 | {"as_printed": figure_9["tasks"] == FIG_9},
         **parts,

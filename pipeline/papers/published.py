@@ -1,10 +1,6 @@
-"""The figures of seed 1 as it counts them, for parity: its constants, its draws, its
-conventions. The honest yardstick is scorecard.py.
-
-Every convention here was found by reproducing a printed figure; none is recommended. What differs from (3):
-the model-based cost is taken on the observer's state and counts the first stage twice; the data-driven cost
-leaves u'Ru undiscounted, discounts e'Qe one step late, takes y(0) for 50 °C at every sensor, and begins with
-seven steps under u = -K_data x that drive the barrel to 0 °C, where 80 % of it accrues.
+"""What seed 1 prints and its script has: its constants and weights, its Algorithm 1 with the script's
+Lyapunov equation, and the windows with one reference. pipeline/papers/temperature.py counts its figures with
+them; the honest yardstick is scorecard.py.
 """
 
 from collections.abc import Sequence
@@ -13,9 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from pipeline.temperature.controllers.kernel import Tuples, regress, tuples, value_iteration
-from pipeline.temperature.plant import Plant, baam
-from pipeline.temperature.tracking import observer_gain
+from pipeline.temperature.controllers.kernel import Tuples, tuples
+from pipeline.temperature.plant import Plant
 
 GAMMA, TAU = 0.99, 0.002
 REFERENCE = np.array([150.0, 160.0, 170.0, 175.0, 180.0])
@@ -48,14 +43,6 @@ PRINTED = {
     "data_driven": {"J100": 1065077.0, "J1000": 1074985.0, "error": 1.2942},
     "data_driven_tuned": {"J100": 204635.7, "J1000": 206358.8, "error": 0.3154},
 }
-
-
-class PublishedFigures(NamedTuple):
-    """J100 and J1000 in the study's own count, and ||r - y|| of the sample it prints as its last, in °C."""
-
-    J100: float
-    J1000: float
-    error: float
 
 
 def augmented(plant: Plant, Q: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -115,78 +102,3 @@ def tuples_with_reference(
         N,
         r,
     )
-
-
-def model_based(weights: tuple[np.ndarray, np.ndarray], K0: np.ndarray) -> PublishedFigures:
-    """Section 6.1: Algorithm 1 from the draw K0 (7, 11), observer (6), (8) from 50 °C, plant from 20 °C. J
-    sums stages 0, 0, 1, ..., 98 of the observer's state."""
-    plant, (q, r) = baam(), weights
-    K = algorithm_1(plant, np.diag(q), np.diag(r), GAMMA, K0, tolerance=0.1).K
-    L = observer_gain(plant, TAU)
-    x, estimate = np.full(plant.n, 20.0), np.full(plant.n, 50.0)
-    stages, y = np.empty(1000), np.empty((1000, plant.p))
-    for t in range(1000):
-        u = -K @ np.concatenate([estimate, REFERENCE])
-        y[t], predicted = plant.C @ x, plant.C @ estimate
-        stages[t] = ((predicted - REFERENCE) ** 2) @ q + u**2 @ r
-        estimate = plant.A @ estimate + plant.B @ u + L @ (y[t] - predicted)
-        x = plant.A @ x + plant.B @ u
-    counted = np.concatenate([stages[:1], stages[:-1]]) * GAMMA ** np.arange(1000)
-    return PublishedFigures(counted[:100].sum(), counted.sum(), np.linalg.norm(REFERENCE - y[99]))
-
-
-def kernel_gains(
-    u: np.ndarray, y: np.ndarray, weights: list[tuple[np.ndarray, np.ndarray]]
-) -> list[np.ndarray]:
-    """Algorithm 2 with the study's settings on its log u (15000, 7), y (15000, 5): N = 6, mu = 1e-4, data /
-    1000; stopped on the gain, which the script's stop at 1e-3 on H leaves the same in the digits printed. K
-    (7, 73) on [w; constant], the constant for the study's reference."""
-    N, scale = 6, 1000.0
-    r = REFERENCE / scale
-    # the last row has no successor in the script
-    data = regress(tuples_with_reference([u[:-1] / scale], [y[:-1] / scale], N, r, np.eye(5)), mu=1e-4)
-    learned = [value_iteration(data, np.diag(q), np.diag(rho), GAMMA, tolerance=1e-7) for q, rho in weights]
-    return [np.column_stack([kernel.K, kernel.k + kernel.K_r @ r]) for kernel in learned]
-
-
-def data_driven(q: np.ndarray, K: np.ndarray) -> PublishedFigures:
-    """Section 6.3 on the study's own start-up, K (7, 73) on [w; constant] in data / 1000. J weighs u with R =
-    I whatever R the gain was learned with."""
-    plant, N, scale = baam(), 6, 1000.0
-    x, u, y = np.full(plant.n, 50.0), np.empty((1001, plant.m)), np.empty((1001, plant.p))
-    for t in range(1001):
-        y[t] = plant.C @ x
-        if t < 7:
-            u[t] = -K_DATA @ x
-        else:
-            w = np.concatenate([u[t - N : t][::-1].ravel(), y[t - N : t][::-1].ravel()])
-            u[t] = -(K[:, :-1] @ w + K[:, -1] * scale)
-        x = plant.A @ x + plant.B @ u[t]
-    y[0] = 50.0
-    late = GAMMA ** np.maximum(np.arange(1001) - 1, 0)
-    stages = late * ((y - REFERENCE) ** 2 @ q) + (u**2).sum(axis=1)
-    return PublishedFigures(stages[:101].sum(), stages.sum(), np.linalg.norm(REFERENCE - y[99]))
-
-
-def figures(K0: np.ndarray, u: np.ndarray, y: np.ndarray) -> dict[str, PublishedFigures]:
-    """All four columns of the study, from its draws."""
-    K_identity, K_tuned = kernel_gains(u, y, [IDENTITY, TUNED_DATA])
-    return {
-        "model_based": model_based(IDENTITY, K0),
-        "model_based_tuned": model_based(TUNED_MODEL, K0),
-        "data_driven": data_driven(IDENTITY[0], K_identity),
-        "data_driven_tuned": data_driven(TUNED_DATA[0], K_tuned),
-    }
-
-
-def algorithm_1_failures(seeds: int) -> int:
-    """How many of `seeds` random K0 ~ N(0, 10) (seeds 0, 1, ...) the published Algorithm 1 does not take to a
-    stabilising gain within 50 policies."""
-    plant, count = baam(), 0
-    for seed in range(seeds):
-        K0 = np.random.default_rng(seed).normal(0.0, 10.0, (plant.m, plant.n + plant.p))
-        result = algorithm_1(
-            plant, np.eye(plant.p), np.eye(plant.m), GAMMA, K0, tolerance=0.1, max_iterations=50
-        )
-        count += not (result.settled and stabilises(plant, result.K[:, : plant.n]))
-    return count

@@ -1,8 +1,8 @@
 """The study's own part, on its simulated machine, which no recording touches: datasets/published ->
 datasets/papers/reproduce_study.json.
 
-Its figures as published; its learners on noise-free and on many noisy data sets; the starts of its Algorithm
-1; and the parity search, Q and R by Bayesian optimisation of its fitness (37), whose optimum is known.
+Its learners on noise-free and on many noisy data sets, and the parity search, Q and R by Bayesian
+optimisation of its fitness (37), whose optimum is known.
 """
 
 import math
@@ -14,15 +14,15 @@ from joblib import delayed
 from pydantic import Field
 from tqdm import tqdm
 
-from pipeline.papers import files, published, study
+from pipeline.papers import files, study
+from pipeline.papers.published import PRINTED
 from pipeline.papers.study_draws import read_published
 from pipeline.store import params
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution, Section
 from pipeline.temperature.test_set import tuning
 
-# samples of a data set of the study, and starts of its algorithm 1
-SAMPLES, STARTS = 15_000, 300
+SAMPLES = 15_000  # of a data set of the study
 
 
 class ReproduceStudy(Section):
@@ -39,11 +39,9 @@ class ReproduceStudy(Section):
 
 
 class Reproduced(NamedTuple):
-    """A row a noisy data set and route, a row a candidate of the parity search, and the figures beside the
-    paper's."""
+    """A row a noisy data set and route, and the figures beside the paper's."""
 
     study: dict[str, list]
-    parity: dict[str, list | np.ndarray]
     metrics: dict[str, Any]
 
 
@@ -65,15 +63,11 @@ def check(settings: ReproduceStudy) -> None:
 
 def reproduced(settings: ReproduceStudy, execution: Execution, folder: str) -> Reproduced:
     """`folder` has the draws behind the paper's figures."""
-    K0, u, y = read_published(folder)
+    _, u, y = read_published(folder)
     rows = _noisy(settings, execution)
     noise_free = study.noise_free(u[1:], y[1:], np.random.default_rng(settings.seed))
-    failures = published.algorithm_1_failures(STARTS)
-    figures = study.metrics(
-        published.figures(K0, u, y), study.exact(), noise_free, rows, failures=failures, starts=STARTS
-    )
-    search = _parity(settings)
-    return Reproduced(rows, study.candidates(search), figures | {"parity": study.parity_metrics(search)})
+    figures = {"printed": PRINTED, **study.exact(), "kernel": noise_free}
+    return Reproduced(rows, figures | {"parity": study.parity_metrics(_parity(settings))})
 
 
 def _noisy(settings: ReproduceStudy, execution: Execution) -> dict[str, list]:
@@ -107,12 +101,8 @@ def _parity(settings: ReproduceStudy) -> tuning.SearchResult:
 
 
 def result(reproduced: Reproduced) -> dict[str, Any]:
-    """What the file holds: the figures, and the tables as lists, eight digits a number."""
-    tables = {"study": reproduced.study, "parity": reproduced.parity}
-    return {"figures": plain(reproduced.metrics)} | {
-        name: plain({key: list(values) for key, values in table.items()}, digits=8)
-        for name, table in tables.items()
-    }
+    """What the file holds: the figures, and the table as lists, eight digits a number."""
+    return {"figures": plain(reproduced.metrics), "study": plain(reproduced.study, digits=8)}
 
 
 def plain(value: Any, digits: int = 17) -> Any:

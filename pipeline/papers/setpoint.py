@@ -20,8 +20,8 @@ from pipeline.papers.search_agent import TrainAgent, first_key, training
 from pipeline.papers.train_agent import guesses
 from pipeline.setpoint.agents import agent, claims, criteria, score, trials
 from pipeline.setpoint.agents.files import restore_published
-from pipeline.setpoint.published import LAMBDA, PHASES, ROTATION
-from pipeline.setpoint.simulation.simulator import Trajectory, nominal, paper_windows, reward, rollout
+from pipeline.setpoint.published import BEST_TEMPERATURE, LAMBDA, PHASES, ROTATION
+from pipeline.setpoint.simulation.simulator import Trajectory, nominal, paper_windows, rollout
 from pipeline.setpoint.tables import AGENT_CURVE
 from pipeline.setpoint.vision.vision_transformer import PAPER, parameters, vision_transformer
 from pipeline.store import artifacts, params
@@ -30,6 +30,7 @@ COMMAND = "./run dvc repro datasets/papers/dvc.yaml:setpoint"
 # start of the single runs: flow in percent, temperature in °C
 SINGLE = {
     "figure_3": (191.0, 213.3),
+    "figure_3_at_210": (191.0, 210.0),
     "figure_7": (232.0, 190.0),
     "case_1": (300.0, 230.0),
     "case_2": (30.0, 190.0),
@@ -44,10 +45,22 @@ PICTURES = {
 # waits, and the time until a picture shows only what was laid after a move, which the paper does not print
 WAITS_S, VIEWS_S = (3.0, 6.0), (0.0, 6.0, 9.0)
 SHOWN_VIEW_S, WAITING_RUNS = 6.0, 4000
-RHO, BETTER = 0.7, 0.85
+# a range from which a setpoint fluctuates, one move of the flow, and below which it is at rest
+FLUCTUATES, AT_REST = 5.0, 0.1
+RHO = 0.7
 # the class right as often as the paper's, and always
 ASKED_TO_WAIT = {"wait": RHO, "sure": 1.0}
-CLASSIFIER = "datasets/kept/train_classifier/figures.json"
+# what the paper prints of single runs: in these of our draws it is looked for, within half a percent
+DRAWS, NEAR = 4000, 0.005
+PRINTED_RUNS: dict[str, dict[str, float]] = {
+    "figure_3": {"rests_at": 101.0},
+    "case_1": {"rests_at": 95.0, "least": 75.0, "most": 130.0, "least_degC": 200.0},
+    "case_2": {"rests_at": 100.0, "most": 130.0, "rests_at_degC": 210.0, "dips_to_degC": 200.0},
+}
+# how often the class is right, tried for "all starts converge"; updates of phases 1 and 2 and seeds, tried
+# for "both fluctuate" and "the flow does"
+TRIED_ACCURACIES = np.arange(70, 101) / 100
+TRIED_UPDATES, TRIED_SEEDS = ((125, 500, 2000), (125, 500, 2000)), (1, 2)
 
 
 class PhaseNetworks(NamedTuple):
@@ -56,11 +69,6 @@ class PhaseNetworks(NamedTuple):
 
     by_name: dict[str, agent.QNetwork]
     rewards: list[np.ndarray]
-
-
-def measured() -> float:
-    """How often the shipped classifier names a window right."""
-    return float(artifacts.read_json(CLASSIFIER)["window_accuracy"])
 
 
 def networks(how: agent.PublishedTraining, seed: int) -> PhaseNetworks:
@@ -82,11 +90,90 @@ def single(path: Trajectory, *, shown: bool) -> dict[str, Any]:
         "temperature": [round(float(v), 2) for v in u[0]],
         "shares": [[round(float(v), 3) for v in row / row.max()] for row in shares],
     }
-    more = {
+    return measure(q, u) | ({"run": run} if shown else {})
+
+
+def measure(q: np.ndarray, u: np.ndarray) -> dict[str, float | None]:
+    """Medians of runs (n, steps + 1): those of claims.measure_runs; where the temperature rests, its least,
+    and its least after it first came within 2 °C of the best."""
+    came = np.maximum.accumulate(np.abs(u - BEST_TEMPERATURE) <= 2.0, axis=1)
+    dips = np.where(came, u, np.inf).min(axis=1)[came.any(axis=1)]
+    return claims.measure_runs(q, u) | {
         "rests_at_degC": float(np.median(u[:, -claims.RESTING :].mean(axis=1))),
         "least_degC": float(np.median(u.min(axis=1))),
+        "dips_to_degC": float(np.median(dips)) if len(dips) else None,
     }
-    return claims.measure_runs(q, u) | more | ({"run": run} if shown else {})
+
+
+def draws(network: agent.QNetwork, start: str, accuracy: float) -> dict[str, Any]:
+    """DRAWS single runs from a start: in how many percent of them each printed figure comes out, in how many
+    draws all do, and the figures of the draw that is nearest to what is printed."""
+    printed, (flow, temperature) = PRINTED_RUNS[start], SINGLE[start]
+    conditions = nominal(np.full(DRAWS, flow), temperature, accuracy=accuracy)
+    key = jax.random.key(agent.JUDGED_SEED)
+    path = rollout(agent.published(network), network, paper_windows(), conditions, key, steps=claims.SHOWN)
+    q, u = (np.asarray(a, float) for a in (path.flow, path.temperature))
+    found = [measure(q[i : i + 1], u[i : i + 1]) for i in range(DRAWS)]
+    off = np.array(
+        [[abs((one[name] or np.inf) / value - 1) for name, value in printed.items()] for one in found]
+    )
+    near = off <= NEAR
+    # most of the printed figures first, then the smallest sum of what the others are off
+    best = np.lexsort((off.sum(axis=1), -near.sum(axis=1)))[0]
+    return {
+        "draws": DRAWS,
+        "percent": dict(zip(printed, (100 * near.mean(axis=0)).tolist(), strict=True)),
+        "figures": len(printed),
+        "nearest_has": int(near[best].sum()),
+        "all": int(near.all(axis=1).sum()),
+        "nearest": found[best],
+    }
+
+
+def right_enough(network: agent.QNetwork) -> dict[str, Any]:
+    """How often the class has to be right until the runs from all starts of a figure, and of all, settle: the
+    least of TRIED_ACCURACIES in percent, and how many settle with it."""
+    found: dict[str, Any] = {}
+    for accuracy in TRIED_ACCURACIES:
+        of = starts(network, float(accuracy))
+        for name, settled in (of["by_figure"] | {"all": of["settled"]}).items():
+            if settled == 100.0:
+                found.setdefault(name, {"right_percent": 100.0 * float(accuracy), "settled": settled})
+    return found
+
+
+def short_phases(how: agent.PublishedTraining) -> dict[str, Any]:
+    """Figure 7 (a) to (d) after shorter phases, whose length the paper does not print: of phase 1 the ranges
+    of flow and temperature over the second half of the run, of phase 2 from each of these the same. How many
+    do as is told, and the figures of the first that does in both phases."""
+    rows: list[dict[str, Any]] = []
+    for seed, first in itertools.product(TRIED_SEEDS, TRIED_UPDATES[0]):
+        train_state, key = agent.begin_published(first_key(seed), how)
+        train_state, before = shortened(train_state, key, how, 0, first)
+        for second in TRIED_UPDATES[1]:
+            _, after = shortened(train_state, key, how, 1, second)
+            rows.append({"seed": seed, "updates": [first, second], "phase_1": before, "phase_2": after})
+    fluctuate = [row for row in rows if min(row["phase_1"]) >= FLUCTUATES]
+    as_told = [row for row in fluctuate if row["phase_2"][0] >= FLUCTUATES and row["phase_2"][1] < AT_REST]
+    flow = [row for row in rows if row["phase_2"][0] >= FLUCTUATES and row["phase_2"][1] < AT_REST]
+    return {
+        "tried": len(rows),
+        "phase_1_as_told": len(fluctuate),
+        "phase_2_as_told": len(flow),
+        "as_told": len(as_told),
+        "nearest": max([*as_told, *flow, *rows], key=lambda row: (row in as_told, min(row["phase_1"]))),
+    }
+
+
+def shortened(
+    train_state: agent.DqnState, key: jax.Array, how: agent.PublishedTraining, i: int, updates: int
+) -> tuple[agent.DqnState, list[float]]:
+    """Phase i + 1 with so many updates, and the ranges in percent and °C of the runs of Figure 7."""
+    lengths = (*how.updates[:i], updates, *how.updates[i + 1 :])
+    train_state = agent.published_phase(train_state, key, how._replace(updates=lengths), i).train_state
+    path = claims.run_start(train_state.network, *SINGLE["figure_7"], accuracy=1.0)  # ty: ignore[invalid-argument-type]
+    told = claims.measure_runs(np.asarray(path.flow, float), np.asarray(path.temperature, float))
+    return train_state, [told["flow_range"], told["temperature_range"]]  # ty: ignore[invalid-explicit-return]
 
 
 def starts(network: agent.QNetwork, accuracy: float) -> dict[str, Any]:
@@ -107,10 +194,30 @@ def starts(network: agent.QNetwork, accuracy: float) -> dict[str, Any]:
         "stay": told.stay.percent,
         "median_steps": float(told.median_steps) if np.isfinite(told.median_steps) else None,
         "by_start": by_start,
+        "together": together(q, u, settled),
         "by_figure": {
             name: float(np.mean([by_start[f"{flow:g}, {temperature:g}"] for flow in flows]))
             for name, (flows, temperature) in APPENDIX.items()
         },
+    }
+
+
+def together(q: np.ndarray, u: np.ndarray, settled: np.ndarray) -> dict[str, float]:
+    """One run from each start, as the paper shows: in how many percent of such repeats all settle, of the
+    starts of each figure and of all 21."""
+    each = {
+        (flow, temperature): settled[(q[:, 0] == flow) & (np.abs(u[:, 0] - temperature) < 1e-3)]
+        for flow, temperature in itertools.product(trials.START_FLOWS, trials.START_TEMPERATURES)
+    }
+    figures = APPENDIX | {"all": (trials.START_FLOWS, None)}
+    return {
+        name: 100.0
+        * float(
+            np.mean(
+                np.all([each[one] for one in each if one[0] in flows and degrees in (None, one[1])], axis=0)
+            )
+        )
+        for name, (flows, degrees) in figures.items()
     }
 
 
@@ -163,13 +270,6 @@ def scaled(shares: list[list[float]]) -> bool:
     return bool((table.max(axis=1) == 1).all() and others.std() > 0.05 and others.mean() < 0.5)
 
 
-def reward_figures() -> dict[str, float]:
-    """(14)-(16) at the points that check the turn of the ellipse."""
-    points = {"at_110_205": (110.0, 205.0), "at_110_215": (110.0, 215.0)}
-    a, b = PHASES[0]
-    return {name: float(reward(jnp.array(q), jnp.array(u), a=a, b=b)) for name, (q, u) in points.items()}
-
-
 def rewards_of(agents: PhaseNetworks, how: agent.PublishedTraining) -> dict[str, Any]:
     """Figure 6: the mean reward of a step times the steps of an episode."""
     phases = [[round(how.dqn.episode * float(value), 3) for value in values] for values in agents.rewards]
@@ -199,13 +299,14 @@ def table_2(how: agent.PublishedTraining) -> dict[str, Any]:
 def arithmetic() -> dict[str, Any]:
     """Numbers of the paper that follow from others of it."""
     seen, valid, combinations, each = 69_668, 56_225, 15, 300
-    steps, seconds = (95, 40), (6.44, 9.43)
-    rests, least, most = 95.0, 75.0, 130.0
+    steps, minutes = (95, 40), (10.21, 6.29)
+    rests, first, least, most = 95.0, 90.0, 75.0, 130.0
     return {
         "valid_percent": 100 * valid / seen,
         "pictures": [combinations * each, valid - combinations * each],
-        "minutes": [count * each_s / 60 for count, each_s in zip(steps, seconds, strict=True)],
-        "case_1_percent": [100 * (1 - least / rests), 100 * (most / rests - 1)],
+        "seconds_a_step": [60 * total / count for count, total in zip(steps, minutes, strict=True)],
+        "case_1_percent": [100 * (1 - first / rests), 100 * (1 - least / rests), 100 * (most / rests - 1)],
+        "case_2_percent": 100 * (130.0 / 100.0 - 1),
     }
 
 
@@ -226,7 +327,7 @@ def sizes(networks: PhaseNetworks) -> dict[str, Any]:
 def main() -> None:
     searched = artifacts.read_json("datasets/papers/search_agent.json")
     how = training(params.load(TrainAgent, "train_agent", params.PAPERS), searched["best"])
-    agents, accuracies = networks(how, searched["seed"]), (1.0, RHO, 1 - RHO, BETTER, measured())
+    agents, accuracies = networks(how, searched["seed"]), (1.0, RHO)
     result: dict[str, Any] = {"command": COMMAND, "agents": {}}
     for name, network in agents.by_name.items():
         row = {f"starts_{100 * accuracy:.0f}": starts(network, accuracy) for accuracy in accuracies}
@@ -239,9 +340,9 @@ def main() -> None:
             name, {place: round(of["settled"], 1) for place, of in row.items() if "settled" in of}, flush=True
         )
     starts_of = result["agents"]["phase_4"]
-    starts_of["waits"] = waits(agents.by_name["phase_4"])
+    last = agents.by_name["phase_4"]
+    starts_of["waits"] = waits(last)
     result |= {
-        "reward": reward_figures(),
         "learning": rewards_of(agents, how),
         "search": searched,
         "kept_from": artifacts.read_json("datasets/papers/train_agent/figures.json")["kept_from"],
@@ -249,15 +350,19 @@ def main() -> None:
         # nothing trains it on a CPU: 31 minutes of two cores for the paper's 73 epochs
         "paper_size": "not run",
         "waiting_helps": waiting_helps(starts_of["waits"]),
-        "measured": starts_of[f"starts_{100 * measured():.0f}"],
+        "right_enough": right_enough(last),
+        "draws": {
+            "figure_3": draws(agents.by_name["phase_3"], "figure_3", 1.0),
+            "case_1": draws(last, "case_1", RHO),
+            "case_2": draws(last, "case_2", RHO),
+        },
+        "short_phases": short_phases(how),
         "parameters": sizes(agents),
         "table_2": table_2(how),
         "arithmetic": arithmetic(),
         "distribution_is_scaled": scaled(result["agents"]["phase_3"]["figure_3_100"]["run"]["shares"]),
         "settings": {
             "right_percent": 100 * RHO,
-            "better_percent": 100 * BETTER,
-            "measured_percent": 100 * measured(),
             "runs": agent.RUNS,
             "shown": claims.SHOWN,
             "resting": claims.RESTING,

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.papers.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, PublishedFigures
+from pipeline.papers.published import GAMMA, K_DATA, REFERENCE, TAU
 from pipeline.temperature.controllers import window as window_route
 from pipeline.temperature.controllers.kernel import Kernel, regress, tuples, value_iteration, window_law
 from pipeline.temperature.plant import Plant, baam, hold_output, hold_state, observability_matrix
@@ -283,50 +283,6 @@ def rows(
     return {"route": route, "noise_degC": noise, "data_set": index, "gap": finite[0], "error_degC": finite[1]}
 
 
-def metrics(
-    as_published: dict[str, PublishedFigures],
-    exact: dict[str, dict[str, float]],
-    noise_free: dict[str, float],
-    table: dict[str, list],
-    *,
-    failures: int,
-    starts: int,
-) -> dict:
-    """The figures by which the learners are known: as published, on the common
-    yardstick without noise, and over the noisy data sets."""
-    result = {
-        "as_published": {name: column._asdict() for name, column in as_published.items()},
-        "printed": PRINTED,
-        "algorithm_1": {"failures": failures, "of": starts},
-        **exact,
-        "kernel": {**noise_free},
-        "window": {},
-        "kernel_predicted_state": {},
-    }
-    for route in ROUTES:
-        for noise in NOISE:
-            mine = [
-                i
-                for i, (r, n) in enumerate(zip(table["route"], table["noise_degC"], strict=True))
-                if (r, n) == (route, noise)
-            ]
-            gaps, errors = (
-                np.nan_to_num([table[name][i] for i in mine], nan=np.inf) for name in ("gap", "error_degC")
-            )
-            stable = int((gaps < 1).sum())
-            figures = {
-                "median_gap": np.median(gaps),
-                "worst_gap": gaps.max(),
-                "median_error_degC": np.median(errors),
-            }
-            result[route][f"noise_{noise:g}".replace(".", "_")] = {
-                **{name: float(value) if np.isfinite(value) else None for name, value in figures.items()},
-                "stable": stable,
-                "of": len(mine),
-            }
-    return result
-
-
 def tuning_objective(theta: np.ndarray) -> float:
     """(37) of theta = [q (5,); r (7,)] on the study's machine: l = 100, from 20 °C, the state known, the gain
     from the discounted Riccati equation."""
@@ -335,22 +291,6 @@ def tuning_objective(theta: np.ndarray) -> float:
     return fitness(
         plant, best.K_x, best.K_r, reference=REFERENCE, gamma=GAMMA, steps=100, x0=np.full(plant.n, 20.0)
     )
-
-
-def tuning_parts(theta: np.ndarray) -> tuple[float, float]:
-    """What tuning_objective adds up, each in its own unit: discounted r.m.s. error e in °C and effort u in
-    percent:
-
-    F = sum_t gamma^t (5 e^2 + 7 u^2)"""
-    plant, discount = baam(), GAMMA ** np.arange(101)
-    best = gains(plant, np.diag(theta[:5]), np.diag(theta[5:]), GAMMA)
-    x, squares = np.full(plant.n, 20.0), np.empty((101, 2))
-    for t in range(101):
-        u = -best.K_x @ x - best.K_r @ REFERENCE - best.k
-        squares[t] = ((plant.C @ x + plant.D @ u + plant.d - REFERENCE) ** 2).mean(), (u**2).mean()
-        x = plant.A @ x + plant.B @ u + plant.b
-    error, effort = np.sqrt(discount @ squares / discount.sum())
-    return float(error), float(effort)
 
 
 def scaled_weights(scale: float = 0.4) -> dict[str, float]:
@@ -371,36 +311,13 @@ def scaled_weights(scale: float = 0.4) -> dict[str, float]:
     }
 
 
-def candidates(result: SearchResult) -> dict[str, list | np.ndarray]:
-    """The candidates of a search for the least (37) as columns, one row a candidate; NaN where one failed."""
-    history = result.history
-    parts = np.array(
-        [
-            (np.nan, np.nan) if failed else tuning_parts(theta)
-            for theta, failed in zip(history.theta, history.failed, strict=True)
-        ]
-    )
-    return {
-        "evaluation": np.arange(1, len(history.cost) + 1),
-        "cost": history.cost,
-        "incumbent": history.incumbent,
-        "tracking_degC": parts[:, 0],
-        "effort_percent": parts[:, 1],
-        "chosen": (history.theta == result.theta).all(axis=1),
-        "failure": list(history.failed),
-    }
-
-
 def parity_metrics(result: SearchResult) -> dict:
     """What a search for the least (37) ends at, beside its known optimum, Q = R = I, and the weights that it
     recommends."""
-    optimum = np.ones(OUTPUTS + INPUTS)
-    tracking_degC, effort_percent = tuning_parts(optimum)
     return {
         "best_cost_perfect_state": result.cost,
-        "optimum": tuning_objective(optimum),
+        "optimum": tuning_objective(np.ones(OUTPUTS + INPUTS)),
         "scaled_weights": scaled_weights(),
-        "trade": {"optimum": {"tracking_degC": tracking_degC, "effort_percent": effort_percent}},
         "q": result.theta[:OUTPUTS],
         "r": result.theta[OUTPUTS:],
     }

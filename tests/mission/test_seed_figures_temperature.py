@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.papers import published
 from pipeline.papers import temperature as paper
-from pipeline.papers.published import IDENTITY, TUNED_DATA, TUNED_MODEL
+from pipeline.papers.published import IDENTITY, TUNED_DATA
 
 
 @pytest.fixture(scope="module")
@@ -19,12 +19,13 @@ def start_gain(root) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("weights", "J100", "J1000", "error"),
-    [(IDENTITY, "183362.5", "183436.2", "0.0376"), (TUNED_MODEL, "76060.36", "76072.6", "0.0274")],
+    ("column", "J100", "J1000", "error"),
+    [("identity", "183362.5", "183436.2", "0.0376"), ("tuned", "76060.36", "76072.6", "0.0274")],
     ids=["figure_3", "figure_4"],
 )
-def test_the_model_based_figures_are_printed(start_gain, weights, J100, J1000, error):
-    figures = published.model_based(weights, start_gain)
+def test_the_model_based_figures_are_printed(start_gain, column, J100, J1000, error):
+    _, script = paper.model_based(start_gain)
+    figures = [script[column][name] for name in ("J100", "J1000", "error")]
     assert as_printed(figures, J100, J1000, error) == (J100, J1000, error)
 
 

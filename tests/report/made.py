@@ -436,7 +436,10 @@ def write(root, *, samples=400, recording="good.mcap"):
         "message": [HOSTILE],
     }
     artifacts.write_table(data / "ingest/quality.parquet", tables.QUALITY, flaw)
-    plant = {"A": (np.diag([0.99, 0.9])[None], "1", "state matrix")}
+    plant = {
+        "A": (np.diag([0.99, 0.9])[None], "1", "state matrix"),
+        "C": (np.eye(2)[None], "1", "output matrix"),
+    }
     artifacts.write_arrays(data / "identify_plant/plant.parquet", "plant", 1, plant)
     order = {
         "order": np.arange(1, 4, dtype=np.int32),

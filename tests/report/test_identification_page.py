@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
+from pipeline.report.identification import pictures
 from pipeline.report.identification.page import since
 from pipeline.report.shared import charts
 from pipeline.store import artifacts, params
@@ -237,6 +238,19 @@ def test_poles_are_listed_with_their_time_constants_and_those_not_found_again_ar
     # -1 / ln 0.99 = 99.5 s, and the spread's 0.989, 0.988 have 90.4 and 82.8 s
     assert "0.9900 99.5 s not found again" in text
     assert "0.9000 9.49 s" in text
+
+
+@pytest.mark.parametrize(
+    ("C", "rank", "samples"), [([[1.0, 0.0]], 2, 2), ([[0.0, 1.0]], 1, 1), (np.eye(2), 2, 1)]
+)
+def test_what_the_outputs_show_of_the_states_is_the_rank_of_the_observability_matrix(C, rank, samples):
+    plant = {"A": np.array([[[0.9, 1.0], [0.0, 0.8]]]), "C": np.array([C])}
+    assert pictures.states_seen(plant) == {"rank": rank, "of": 2, "samples": samples}
+    assert pictures.states_seen(None) is None
+
+
+def test_the_page_says_whether_the_model_is_observable(project):
+    assert "The outputs show 2 of 2 states within one sample: observable." in page()
 
 
 def test_advice_and_the_remedies_that_it_does_not_speak_of_stand_under_what_to_do(project):

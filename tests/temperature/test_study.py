@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline.papers import files, made, reproduce_study, study
-from pipeline.papers.published import GAMMA, REFERENCE
+from pipeline.papers.published import REFERENCE
 from pipeline.papers.reproduce_study import ReproduceStudy
 from pipeline.store import params
-from pipeline.temperature.test_set import tuning
 from tests.house import expected_of_paper
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -84,7 +83,7 @@ def test_the_index_of_the_tuner_is_the_known_optimum_at_equal_weights_and_more_e
         assert study.tuning_objective(changed) > best
 
 
-def test_noisy_data_sets_become_a_table_and_its_figures():
+def test_noisy_data_sets_become_a_table():
     work = [(noise, i) for noise in study.NOISE for i in range(3)]
     results = [
         {route: (10.0 * noise + i + k, 0.1 * i) for k, route in enumerate(study.ROUTES)} for noise, i in work
@@ -92,24 +91,7 @@ def test_noisy_data_sets_become_a_table_and_its_figures():
     results[0]["kernel"] = (float("inf"), float("nan"))
     table = study.rows(work, results)
     assert len(table["gap"]) == len(work) * len(study.ROUTES)
-    gaps = {"gap": 6, "gap_window_6": 7, "any_reference_gap": 8}
-    figures = study.metrics({}, {"optimal": {"J1000": 1}}, gaps, table, failures=9, starts=10)
-    assert figures["window"]["noise_0_1"] == {
-        "median_gap": 2.0,
-        "worst_gap": 3.0,
-        "median_error_degC": pytest.approx(0.1),
-        "stable": 0,
-        "of": 3,
-    }
-    kernel = figures["kernel"]["noise_0_1"]
-    # an unstable one is the worst, and no number
-    assert (kernel["worst_gap"], kernel["median_gap"], kernel["stable"]) == (None, 4.0, 0)
-    assert (
-        figures["kernel"]["gap"],
-        figures["kernel"]["any_reference_gap"],
-        figures["optimal"]["J1000"],
-    ) == (6, 8, 1)
-    assert figures["algorithm_1"] == {"failures": 9, "of": 10}
+    assert np.isnan(table["gap"][1]) and table["gap"][0] == 1.0
 
 
 def test_the_study_s_panel_holds_every_cell_at_20_degrees():
@@ -121,26 +103,6 @@ def test_the_study_s_panel_holds_every_cell_at_20_degrees():
 
 
 # ---- the parity search
-
-
-@pytest.mark.parametrize("theta", [np.ones(12), np.linspace(0.05, 0.9, 12)])
-def test_error_and_effort_add_up_to_the_studys_objective(theta):
-    error, effort = study.tuning_parts(theta)
-    total = (GAMMA ** np.arange(101)).sum() * (5 * error**2 + 7 * effort**2)
-    # the same run, by steps instead of by products of matrices
-    np.testing.assert_allclose(total, study.tuning_objective(theta), rtol=1e-9)
-
-
-def test_each_candidate_has_the_error_and_the_effort_that_make_its_cost_and_a_failed_one_none():
-    theta = np.stack([np.ones(12), np.full(12, 0.5), np.linspace(0.05, 0.9, 12)])
-    cost = np.array([study.tuning_objective(theta[0]), np.nan, study.tuning_objective(theta[2])])
-    history = tuning.History(theta, cost, ("", "no gain", ""), np.fmin.accumulate(cost))
-    table = study.candidates(tuning.SearchResult(theta[0], float(cost[0]), history))
-    total = (GAMMA ** np.arange(101)).sum() * (
-        5 * table["tracking_degC"] ** 2 + 7 * table["effort_percent"] ** 2
-    )
-    np.testing.assert_allclose(total, cost, rtol=1e-9)  # by steps instead of by products; NaN where it failed
-    assert table["chosen"].tolist() == [True, False, False] and table["failure"] == ["", "no gain", ""]
 
 
 def test_the_parity_search_ends_near_the_known_optimum_with_weights_whose_cost_it_states():
@@ -179,7 +141,7 @@ def test_a_search_without_room_is_refused_in_one_sentence(change, sentence):
 
 
 def test_the_file_holds_what_a_small_run_of_the_stage_comes_to(tmp_path, monkeypatch):
-    """The optimum and Algorithm 1's starts are the known ones at any size; what has no end is null."""
+    """The optimum is the known one at any size; what has no end is null."""
     settings = params.load(ReproduceStudy, "reproduce_study", ROOT / params.PAPERS)
     small = settings.model_copy(update={"data_sets": 1, "initial": 4, "evaluations": 8})
     execution = params.load(params.Execution, "execution", ROOT / "params.yaml")
@@ -192,11 +154,7 @@ def test_the_file_holds_what_a_small_run_of_the_stage_comes_to(tmp_path, monkeyp
     accepted = json.loads((ROOT / "datasets/papers/reproduce_study.json").read_text())
     figures = written["figures"]
     assert figures["optimal"]["J1000"] == pytest.approx(151_875.28, abs=0.01)  # printed digits
-    for key in ("optimal", "observer", "algorithm_1", "takeover"):
+    for key in ("optimal", "observer", "takeover"):
         assert figures[key] == pytest.approx(accepted["figures"][key], rel=1e-6), key
-    for key, column in accepted["figures"]["as_published"].items():
-        assert figures["as_published"][key] == pytest.approx(column, rel=1e-6), key
-    assert figures["window"]["noise_0_1"]["of"] == 1
-    assert len(written["parity"]["cost"]) == 8
     assert len(written["study"]["gap"]) == 2 * len(study.ROUTES)
     assert reproduce_study.plain({"a": np.inf, "b": np.array([1.0, np.nan])}) == {"a": None, "b": [1.0, None]}

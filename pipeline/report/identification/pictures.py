@@ -426,7 +426,8 @@ def order(sources: Sources) -> dict[str, Any]:
 @as_matrix("poles", "Poles, and how surely they are known")
 def poles(sources: Sources) -> dict[str, Any]:
     """Each pole of the model, a pair in one row: size, time constant with its 90 % band over the spread, and
-    period in s; how many poles and plants there are, the largest size, and the bandwidth."""
+    period in s; how many poles and plants there are, the largest size, the bandwidth, and what the sensors
+    see of the states."""
     table, step = pd.DataFrame(need(sources.tables["poles"])), sources.declared.machine.sample_time_s
     table["size"] = np.hypot(table["real"], table["imag"])
     table["constant_s"] = [_constant(size, step) for size in table["size"]]
@@ -443,8 +444,20 @@ def poles(sources: Sources) -> dict[str, Any]:
         "largest": float(model["size"].max()),
         "plants": int(table.member.max()),
         "bandwidth": entry(sources.metrics["identify_plant"], "bandwidth_rad_s"),
+        "seen": states_seen(known(sources.tables["plant"], None)),
         "origin": page.origin(sources.source("poles")),
     }
+
+
+def states_seen(plant: Table | None) -> dict[str, int] | None:
+    """The rank of the observability matrix [C; CA; ...] of a plant stored as A (1, n, n) and C (1, p, n), n,
+    and the samples in a row that reach that rank."""
+    if plant is None:
+        return None
+    A, C = (np.asarray(plant[name], float)[0] for name in "AC")
+    matrix = np.vstack([C @ np.linalg.matrix_power(A, i) for i in range(len(A))])
+    ranks = [int(np.linalg.matrix_rank(matrix[: len(C) * blocks])) for blocks in range(1, len(A) + 1)]
+    return {"rank": ranks[-1], "of": len(A), "samples": ranks.index(ranks[-1]) + 1}
 
 
 def _constant(size: float, step: float) -> float:

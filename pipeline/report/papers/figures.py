@@ -4,7 +4,8 @@ Jinja, words are its templates. Both know the paper's results, the axes and the 
 
 import itertools
 import tomllib
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from markupsafe import Markup
 from pipeline.report.papers import derived
 from pipeline.report.shared import charts, page
 
+# of what is printed: figure, panel, x, y
+Mark = tuple[str, int, float, float]
 FILE = Path(__file__).with_name("figures.toml")
 # of a picture, px: as wide as a phone, so that a text keeps its size there
 WIDTH, HEIGHT = 360, 200
@@ -28,23 +31,40 @@ def axis(low: float, high: float) -> charts.Axis:
 KNOWN = {"axis": axis, "linear": charts.linear, "logarithmic": charts.logarithmic, **derived.KNOWN}
 
 
-def pictures(paper: str, results: Mapping[str, Any], tables: Mapping[str, Any]) -> list[dict[str, Any]]:
+def pictures(
+    paper: str, results: Mapping[str, Any], tables: Mapping[str, Any], marks: Iterable[Mark] = ()
+) -> list[dict[str, Any]]:
     """The figures of a paper: place there, title, caption, panels as SVG, and a table (heads, rows). `tables`
-    are those of the run, {name: columns or None}; a figure that needs one is left out without it."""
+    are those of the run, {name: columns or None}; a figure that needs one is left out without it. `marks` are
+    the crosses of what is printed.
+
+    Raises ValueError where a mark has no figure or panel.
+    """
     described = tomllib.loads(FILE.read_text(encoding="utf-8"))
     context = {**KNOWN, **results, "tables": tables}
+    crosses = defaultdict(list)
+    for at, panel, x, y in marks:
+        crosses[at, panel].append((x, y))
+    places = {(one["at"], i) for one in described[paper] for i in range(len(one.get("panels", ())))}
+    if lost := sorted(crosses.keys() - places):
+        raise ValueError(f"{paper}: expected a figure and panel for each mark, found none for {lost[0]}")
     figures = [one for one in described[paper] if "needs" not in one or tables[one["needs"]]]
-    return [_figure(one, described["panel"], context) for one in figures]
+    return [_figure(one, described["panel"], context, crosses) for one in figures]
 
 
-def _figure(figure: Mapping[str, Any], panels: Mapping[str, Any], context: dict[str, Any]) -> dict[str, Any]:
+def _figure(
+    figure: Mapping[str, Any],
+    panels: Mapping[str, Any],
+    context: dict[str, Any],
+    crosses: Mapping[tuple[str, int], list[tuple[float, float]]],
+) -> dict[str, Any]:
     context = context | {name: _value(text, context) for name, text in figure.get("where", {}).items()}
     named = [panels[one] if isinstance(one, str) else one for one in figure.get("panels", ())]
     return {
         "at": figure["at"],
         "title": _words(figure["title"], context),
         "caption": _words(figure.get("caption", ""), context),
-        "panels": [plot(one, context) for one in named],
+        "panels": [plot(one, context, crosses[figure["at"], i]) for i, one in enumerate(named)],
         "table": _value(figure["table"], context) if "table" in figure else None,
     }
 
@@ -64,19 +84,27 @@ def _rows(values: Any) -> list[np.ndarray]:
     return [np.asarray(row, float) for row in (values if nested else [values])]
 
 
-def plot(panel: Mapping[str, Any], context: Mapping[str, Any]) -> Markup:
+def plot(
+    panel: Mapping[str, Any], context: Mapping[str, Any], crosses: Sequence[tuple[float, float]] = ()
+) -> Markup:
     """One frame. `lines` are [x, y, class, name]. y may hold several rows; `per` divides it. `title` names
-    both axes. The rest is optional: axes `across` and `up`; `levels` with names; centred `texts` (text, x,
-    y); `spans` (begin, end, x of the text, text); `way`, a ring and a dot at the ends of the last line."""
+    both axes. The rest is optional: axes `across` and `up`, which know the highest value as `high`; `levels`
+    with names; centred `texts` (text, x, y); `spans` (begin, end, x of the text, text); `way`, a ring and a
+    dot at the ends of the last line. `crosses` (x, y) are what the paper prints."""
     curves = []
     for *data, css, name in panel["lines"]:
         xs, ys = (_rows(_value(text, context)) for text in data)
         pairs = zip(itertools.cycle(xs), ys, strict=False)
         curves += [(x, y / panel.get("per", 1), css, name) for x, y in pairs]
-    ends = [float(bound(x)) for x, *_ in curves for bound in (np.min, np.max)]
-    values = np.concatenate([y for _, y, *_ in curves])
+    crosses = [(x, y / panel.get("per", 1)) for x, y in crosses]
+    ends = [float(end) for x, *_ in curves for end in (np.min(x), np.max(x))] + [
+        x for x, _ in crosses if not np.isnan(x)
+    ]
+    values = np.concatenate([*(y for _, y, *_ in curves), [y for _, y in crosses]])
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    across, up = (_value(panel[key], context) if key in panel else None for key in ("across", "up"))
+    across, up = (
+        _value(panel[key], {**context, "high": high}) if key in panel else None for key in ("across", "up")
+    )
     frame = charts.Frame(
         across or charts.linear(min(ends), max(ends)),
         up or axis(low, high),
@@ -107,4 +135,13 @@ def plot(panel: Mapping[str, Any], context: Mapping[str, Any]) -> Markup:
             charts.dots(frame, x[0], y[0], "begin", 4),
             charts.dots(frame, x[-1], y[-1], "dot whole", 4),
         ]
+    layers += [cross(frame, x, y) for x, y in crosses]
     return charts.panel(frame, layers, alt=_words(panel["alt"], context), title=panel["title"])
+
+
+def cross(frame: charts.Frame, x: float, y: float) -> Markup:
+    """The mark of a value that the paper prints; a line if it does not print where."""
+    if np.isnan(x):
+        return charts.level(frame, y, "printed")
+    across, up = (float(at(value)) for at, value in ((frame.px, x), (frame.py, y)))
+    return Markup('<path class="printed" d="M{:.1f} {:.1f}h12m-6-6v12"/>').format(across - 6, up)

@@ -41,9 +41,10 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
             {
                 "key": key,
                 "paper": paper,
-                "brief": brief(paper),
                 "rows": paper.rows,
-                "pictures": pictures(key, paper.results, tables),
+                "pictures": pictures(
+                    key, paper.results, tables, [mark for row in paper.rows for mark in row.marks]
+                ),
                 "files": (printed, results),
                 "made": " ".join(
                     made.sentence(one) for one in (key, *filter(made.changed, PARTS.get(key, ())))
@@ -57,14 +58,9 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
         sources=sources,
         title="Three papers beside us",
         decision=decision(papers),
-        verdicts=VERDICTS,
+        verdicts=(HOLDS, SHAPE, "only with a change", FAILS, OPEN),
         counts=[
-            {
-                "key": paper.key,
-                "title": paper.title,
-                "rows": len(paper.rows),
-                "counts": [paper.count(verdict) for verdict in VERDICTS],
-            }
+            {"key": paper.key, "title": paper.title, "rows": len(paper.rows), "counts": counts(paper)}
             for paper in papers
         ],
         papers=shown,
@@ -87,17 +83,17 @@ def _results(path: str, stage: str) -> dict[str, Any]:
 
 def decision(papers: Sequence[Paper]) -> str:
     """What all papers come to, in a sentence."""
-    rows = sum(len(paper.rows) for paper in papers)
-    if not rows:
+    if not papers:
         return "No paper is set beside us: the results are not there."
-    holds, shape, fails, opened = (sum(paper.count(verdict) for paper in papers) for verdict in VERDICTS)
+    holds, shape, mended, fails, opened = (sum(column) for column in zip(*map(counts, papers), strict=True))
     return (
-        f"Of {rows} tables, figures and numbers of the papers {holds} hold, {shape} hold in shape, "
-        f"{fails} do not hold, and {opened} cannot be judged."
+        f"Of {holds + shape + mended + fails + opened} tables, figures and numbers {holds} hold, {shape} in "
+        f"shape, {mended} only with a named change, {fails} do not; {opened} cannot be judged."
     )
 
 
-def brief(paper: Paper) -> list[tuple[str, list[str]]]:
-    """The places of the rows that do not hold, and of those that cannot be judged, each once."""
-    places = {verdict: [row.at for row in paper.rows if row.verdict == verdict] for verdict in (FAILS, OPEN)}
-    return [(verdict, list(dict.fromkeys(at))) for verdict, at in places.items() if at]
+def counts(paper: Paper) -> list[int]:
+    """How many rows hold, hold in shape, hold only with the change that they name, do not hold, and cannot be
+    judged."""
+    holds, shape, fails, opened = (paper.count(verdict) for verdict in VERDICTS)
+    return [holds, shape, paper.mended(), fails - paper.mended(), opened]

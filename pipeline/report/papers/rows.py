@@ -32,16 +32,20 @@ class Entry(NamedTuple):
 
 
 class PaperRow(NamedTuple):
-    """A table, a figure or a number of a paper: its place there, what it says, printed and ours as text, the
-    verdict, how it is counted and why they part, and the lines of a table."""
+    """A table, a figure or a number of a paper: its place there, what it says, printed and ours as text; ours
+    with the smallest change that was found, and whether it holds with it; the verdict, how it is counted and
+    why they part; the lines of a table; and the marks of what is printed, (figure, panel, x, y)."""
 
     at: str
     what: str
     printed: str
     ours: str
+    changed: str
+    mended: bool
     verdict: str
     why: str
     entries: list[Entry]
+    marks: list[tuple[str, int, float, float]]
 
 
 class Paper(NamedTuple):
@@ -58,6 +62,10 @@ class Paper(NamedTuple):
 
     def count(self, verdict: str) -> int:
         return sum(row.verdict == verdict for row in self.rows)
+
+    def mended(self) -> int:
+        """The rows that do not hold, and do with the change that they name."""
+        return sum(row.verdict == FAILS and row.mended for row in self.rows)
 
 
 def read(printed: str, results: str, metrics: Mapping[str, Any]) -> "Paper | Missing":
@@ -107,9 +115,30 @@ def _row(one: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -
         printed, shown = f"{len(entries)} entries", f"{agree} of {len(entries)} as printed"
     else:
         shown = _shown(ours, unit, one.get("ours_places", places))
-    verdict = _verdict(one, ours, entries)
-    why = _filled(one.get("why", ""), found, metrics, printed, place)
-    return PaperRow(one["at"], one["what"], printed, shown, verdict, why, entries)
+    changed = _ours({**one, "ours": one.get("changed")}, found, metrics, place)
+    return PaperRow(
+        one["at"],
+        one["what"],
+        printed,
+        shown,
+        "" if changed is None else _shown(changed, unit, one.get("ours_places", places)),
+        changed is not None and _verdict(one, changed, entries) in (HOLDS, SHAPE),
+        _verdict(one, ours, entries),
+        _filled(one.get("why", ""), found, metrics, printed, place),
+        entries,
+        _marks(one),
+    )
+
+
+def _marks(one: Mapping[str, Any]) -> list[tuple[str, int, float, float]]:
+    """Where its `mark` draws what a row prints: at x of a panel of its figure, one or one each, or at y; x is
+    NaN if the paper does not print where."""
+    if (mark := one.get("mark")) is None:
+        return []
+    printed = _list(one["printed"])
+    other = _list(mark.get("y", mark.get("x", math.nan))) * len(printed)
+    pairs = [(a, b) if "y" in mark else (b, a) for a, b in zip(printed, other, strict=False)]
+    return [(mark.get("figure", one["at"]), mark.get("panel", 0), *pair) for pair in pairs]
 
 
 def _entry(line: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -> Entry:
@@ -164,15 +193,16 @@ def _verdict(one: Mapping[str, Any], ours: Any, entries: list[Entry]) -> str:
     if rule == "not_judged" or gap_of(ours) or not one.get("judged", True):
         return OPEN
     if rule == "entries":
-        agree = sum(entry.verdict == HOLDS for entry in entries)
-        return HOLDS if agree == len(entries) else SHAPE if agree else FAILS
+        return HOLDS if all(entry.verdict == HOLDS for entry in entries) else FAILS
     if rule in ("claim", "shape"):
         return (HOLDS if rule == "claim" else SHAPE) if ours else FAILS
     if rule == "same":
         return HOLDS if _same(printed, ours) else FAILS
     if rule in ("at_most", "at_least"):
-        bound = one.get("bound", printed)
-        return HOLDS if (ours <= bound if rule == "at_most" else ours >= bound) else FAILS
+        # a bound of ours stands for words of the paper that print none
+        bound = one.get("bound", one.get("our_bound", printed))
+        kept = all(value <= bound if rule == "at_most" else value >= bound for value in _list(ours))
+        return FAILS if not kept else SHAPE if "our_bound" in one else HOLDS
     if rule == "within":
         apart = max(100 * abs(b / a - 1) for a, b in zip(_list(printed), _list(ours), strict=True))
         near, far = (one.get(key, 0) * (1 + ROUNDING) for key in ("percent", "shape_percent"))
