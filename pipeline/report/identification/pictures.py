@@ -444,6 +444,7 @@ def poles(sources: Sources) -> dict[str, Any]:
         "largest": float(model["size"].max()),
         "plants": int(table.member.max()),
         "bandwidth": entry(sources.metrics["identify_plant"], "bandwidth_rad_s"),
+        "record_s": step * (entry(sources.metrics["ingest"], "samples") or math.inf),
         "seen": states_seen(known(sources.tables["plant"], None)),
         "origin": page.origin(sources.source("poles")),
     }
