@@ -567,7 +567,8 @@ def pair_sentence(choice: Any) -> PairSentence:
         f"{_the(winner)} brings {number(abs(gap), 1)} points more of its runs to the target and keeps them "
         f"there than {_the(other)} {same} (90{THIN}% interval {ends} points)"
     )
-    short = f"{head} {winner}, {number(abs(gap), 1)} points more runs settle than by {_the(other)} ({ends})."
+    short = f"{head} {winner}, {number(abs(gap), 1)} points more runs settle and stay than by "
+    short = f"{short}{_the(other)} ({ends})."
     return PairSentence(f"{head} {text}.", winner, short)
 
 

@@ -59,7 +59,7 @@ def test_the_default_is_named_with_its_worst_case_and_the_pair_is_answered(proje
 def test_page_one_and_the_report_s_file_answer_which_of_the_pair_is_better(project):
     main()
     assert (
-        "Bayes filter, 41.0 points more runs settle than by the paper's agent (38.5–43.5)."
+        "Bayes filter, 41.0 points more runs settle and stay than by the paper's agent (38.5–43.5)."
         in Page(INDEX).text
     )
     assert figures()["verdicts"]["setpoint"]["answer"].replace("\u202f", " ") == PAIRED

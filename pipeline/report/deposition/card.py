@@ -158,8 +158,9 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     """Six seconds of the part on which the composer in use fares worst, about its largest error."""
     parts, table = need(structures(sources.evidence)), need(sources.tables["signals"])
     names = shown(verdict.winner or "", parts)
-    found = worst(parts, names[0])
-    rows = [] if found is None else _stretch(table, found[1], names[0])
+    used = verdict.winner or names[0]
+    found = worst(parts, used)
+    rows = [] if found is None else _stretch(table, found[1], used)
     if found is None or not len(rows):
         return Missing("not measured", "no flow of the part that decides was kept")
     part = found[1]

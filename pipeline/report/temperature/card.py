@@ -38,7 +38,10 @@ def card(sources: Sources, judged: Judgement, verdict: Verdict) -> Card:
         verdict,
         MOVES,
         _step(sources, verdict),
-        entrants=[entrant(name, heading(name), note) for name, note in names.items()],
+        entrants=[
+            entrant(name, heading(name), f"{note}{failure(judged, name, keys)}")
+            for name, note in names.items()
+        ],
         rows=[_row(asked[key], judged, list(names)) for key in keys if key in asked] if told else [],
         basis=f"90{THIN}% quantile; small: 90{THIN}% band",
         cost=_cost(sources),
@@ -46,6 +49,20 @@ def card(sources: Sources, judged: Judgement, verdict: Verdict) -> Card:
         sources=sources.source("evaluate_temperature"),
         missing=gap.sentence() if gap else "",
     )
+
+
+def failure(judged: Judgement, name: str, shown: Sequence[str]) -> str:
+    """The first rule that a controller fails, if none of the figures `shown` says so."""
+    answers = judged.answers.get(name, {})
+    failed = [
+        question
+        for question in judged.asked
+        if state(question, answers.get(question.key, NOT_JUDGED)) == FAILED
+    ]
+    if not failed or any(question.key in shown for question in failed):
+        return ""
+    # "Margin: disk, of the weakest tenth" -> "disk margin"
+    return f"; fails {' '.join(reversed(failed[0].title.split(', ')[0].lower().split(': ')))}"
 
 
 @or_nothing
@@ -128,11 +145,12 @@ def deciding(
     seconds = until_settled(table, runs, zone)
     early = {who: rows[table["time_s"][rows] <= seconds] for who, rows in runs.items()}
     label = sources.zone([o.name for o in sources.declared.machine.outputs].index(zone))
-    ends = {
-        who: float(np.abs(table[zone] - table[f"{zone}_reference"])[rows[-1]]) for who, rows in runs.items()
-    }
-    listed = ", ".join(f"{i} {heading(who)} {short(end, 2)}" for i, (who, end) in enumerate(ends.items(), 1))
-    finding = f"{lead}In °C, {label} ends off its reference by: {listed}."
+    off = np.abs(table[zone] - table[f"{zone}_reference"])
+    listed = ", ".join(
+        f"{i} {heading(who)} {short(float(off[rows[-1]]), 2)}"
+        for i, (who, rows) in enumerate(early.items(), 1)
+    )
+    finding = f"{lead}In °C, {label} is off its reference after {short(seconds, 2)} s by: {listed}."
     finding = f"{finding} Grey: the limit."
     return Deciding(
         finding,
