@@ -526,9 +526,9 @@ def _conditions(asked: Sequence[Rule], rendered: bool) -> str:
         f"{rule.text}{', undecided' if rule.state == UNDECIDED else ''})"
         for rule in short
     ]
-    real = " Recordings of the real printer: none are in (datasets/raw/setpoint)." if rendered else ""
+    real = " Recordings of the real printer: none yet; they go to datasets/raw/setpoint." if rendered else ""
     remedies = dict.fromkeys(rule.remedy for rule in short if rule.remedy)
-    return f"Before it may: {', '.join(figures)}.{real} To try: {' '.join(remedies)}"
+    return f"Missing before it may run: {', '.join(figures)}.{real} To try: {' '.join(remedies)}"
 
 
 def _closest(name: str, rule: Rule) -> str:
