@@ -32,7 +32,7 @@ LOOPS = {
         "**[Temperature](docs/explanation/temperature.md)**: one hot end, or the zones of a barrel",
         "heater power and temperatures",
         "a controller with a robustness certificate: C99, Python or Klipper module",
-        "PI, LQG, VARX + Riccati, learned kernel",
+        "PI, LQG, VARX + Riccati, learned kernel, predictive control",
     ),
     "deposition": (
         "**[Deposition](docs/explanation/deposition.md)**: flow of a plunger extruder",
