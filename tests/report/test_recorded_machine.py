@@ -48,7 +48,7 @@ def test_nothing_of_the_study_stands_on_the_page_of_a_users_machine(recorded):
 
 def test_zones_of_a_users_machine_have_its_names(recorded):
     main()
-    assert "zone_1 ends" in TEMPERATURE.read_text()
+    assert "zone_1 is off" in TEMPERATURE.read_text()
     assert not re.search(r"zone 1\b", TEMPERATURE.read_text())
 
 
