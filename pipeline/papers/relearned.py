@@ -1,21 +1,19 @@
-"""The temperature comparison done again: would its sentences stay true on another record, with other tuning
-seeds, on other plants, and with less or more prior knowledge of how far plants differ?
+"""The temperature comparison by record length: what each controller costs that was learned and tuned from a
+record of its own, and where the pair of a model-based and a data-driven one changes places.
 
-`./run dvc repro datasets/papers/dvc.yaml:relearned` relearns everything from fresh records (probing,
-identification, kernel, tuning of every controller, judging; each with seeds of its own, the plants too),
-tunes five times on one record, and removes and adds the prior for all controllers alike. It takes hours and
-writes datasets/papers/relearned.json, which papers.html shows: the interval of the relearnings, smallest to
-largest, into which a further one falls with probability (n - 1) / (n + 1). No verdict, choice or export reads
-it. `./run python -m pipeline.papers.relearned --fresh 8` only counts how many figures of 8 further
-relearnings lie in the intervals on file.
+`./run dvc repro datasets/papers/dvc.yaml:relearned` does everything anew for RECORDS fresh records of each
+length (probing, identification, kernel, tuning of every controller, judging; each with seeds of its own, the
+plants too), and removes and adds the prior of plant uncertainty for all controllers alike. It takes an hour
+on two cores and writes datasets/papers/relearned.json, which papers.html shows. No verdict, choice or export
+reads it.
 """
 
 import argparse
 import contextlib
 import io
-import json
 import tempfile
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +22,20 @@ import numpy as np
 
 from pipeline.papers import files
 from pipeline.store import artifacts, params
+from pipeline.temperature.controllers.table import CONTROLLERS
 from pipeline.temperature.settings import TemperatureRules
 from pipeline.temperature.tables import CASES
 from pipeline.temperature.test_set.best import best_by_limits
+from pipeline.temperature.test_set.record_length import curves
 from stages import evaluate_temperature, identify_plant, ingest, learn_kernel, probe_machine, tune_weights
 from stages.evaluate_temperature import EvaluateTemperature
 
 COMMAND = "./run dvc repro datasets/papers/dvc.yaml:relearned"
 STAGES = (probe_machine, ingest, identify_plant, learn_kernel, tune_weights, evaluate_temperature)
-FIGURES = ("settled_error", "settling", "overshoot", "at_limits", "energy", "cost", "rms")
-ENDS = ("median", "q90")
+# samples of a record: a quarter of the default, the default, the study's own, and ten times the default
+LENGTHS = (1500, 6000, 15000, 60000)
+DEFAULT = 6000
+RECORDS, PRIOR_RECORDS = 5, 3
 # what a relearning changes: everything that is drawn
 SEEDS = ("generate_probing.seed", "identify_plant.seed", "tune_weights.seed", "panel.training.seed",
          "panel.judging.seed")  # fmt: skip
@@ -46,9 +48,8 @@ PRIORS: dict[str, dict[str, Any]] = {
 
 
 def relearn(drawn: Mapping[str, int], changes: Mapping[str, Any]) -> dict:
-    """The metrics of evaluate_temperature, and the cost of each tuned controller, of one run of the stages in
-    a folder of its own, with other seeds and other parameters."""
-    root = Path.cwd()
+    """What one run of the stages comes to, in a folder of its own, with other seeds and other parameters."""
+    root, began = Path.cwd(), time.process_time()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for path, values in params.files(root / params.FILE).items():
@@ -71,91 +72,63 @@ def relearn(drawn: Mapping[str, int], changes: Mapping[str, Any]) -> dict:
                         stage.main()
                 except SystemExit:
                     raise ValueError(f"a relearning failed: {said.getvalue().strip()}") from None
-        compared, tuned = (
-            artifacts.read_json(folder / "datasets" / name / "figures.json")
-            for name in ("evaluate_temperature", "tune_weights")
-        )
+        compared = artifacts.read_json(folder / "datasets" / "evaluate_temperature" / "figures.json")
         cases = artifacts.read_table(folder / "datasets" / "evaluate_temperature" / "cases.parquet", CASES)
         rules = params.load(TemperatureRules, "report", folder / params.FILE)
         seed = params.load(EvaluateTemperature, "evaluate_temperature", folder / params.FILE).seed
-        judged = best_by_limits(compared, cases, rules.model_dump(), seed)
-        return (
-            compared
-            | judged
-            | {"tuned_cost": {key: one["cost"] for key, one in tuned["contestants"].items()}}
-        )
+        return {
+            "cpu_s": time.process_time() - began,
+            "costs": mean_log_costs(cases),
+            "refused": compared["refused"],
+            "pair": compared["pair"],
+            "best": best_by_limits(compared, cases, rules.model_dump(), seed)["best"],
+        }
 
 
-def figures(runs: list[dict]) -> dict[str, Any]:
-    """By contestant and figure the smallest, middle and largest median and 90 % quantile of the runs; None
-    where a run has none (never settles)."""
-    names = [name for name in runs[0]["contestants"] if all(name in run["contestants"] for run in runs)]
-    result: dict[str, Any] = {}
-    for name in names:
-        for figure in FIGURES:
-            for end in ENDS:
-                values = [run["contestants"][name][figure][end] for run in runs]
-                finite = np.array([np.inf if value is None else value for value in values])
-                low, middle, high = finite.min(), np.median(finite), finite.max()
-                result.setdefault(name, {}).setdefault(figure, {})[end] = {
-                    key: float(value) if np.isfinite(value) else None
-                    for key, value in (("low", low), ("median", middle), ("high", high))
-                }
+def mean_log_costs(cases: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """By contestant the mean over plants of the logarithm of a plant's mean cost, as the comparison counts
+    it; those whose cost is missing in a case are left out."""
+    result = {}
+    for name in dict.fromkeys(cases["contestant"].tolist()):
+        own = cases["contestant"] == name
+        plant, cost = cases["plant"][own], cases["cost"][own]
+        means = np.bincount(plant, weights=cost)[np.unique(plant)] / np.bincount(plant)[np.unique(plant)]
+        if np.isfinite(means).all():
+            result[str(name)] = float(np.log(np.maximum(means, 1e-9)).mean())
     return result
 
 
-def answers(runs: list[dict]) -> dict[str, Any]:
-    """How often each contestant was the best, and won the pair; and the largest differences of the runs."""
+def answers(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """How often each contestant was the best and won the pair, by how much, and the CPU time of all."""
 
     def counted(values: list) -> dict[str, int]:
         return {str(value): values.count(value) for value in dict.fromkeys(values)}
 
     return {
-        "runs": len(runs),
+        "records": len(runs),
         "best": counted([run["best"] for run in runs]),
-        "leading": counted([run["best_reason"]["leading"] for run in runs]),
         "pair_winner": counted([run["pair"]["winner"] for run in runs]),
         "pair_difference_percent": [run["pair"]["difference"] for run in runs],
+        "cpu_s": round(sum(run["cpu_s"] for run in runs)),
     }
 
 
-def spread_percent(runs: list[dict]) -> dict[str, Any]:
-    """Of runs on one record: by contestant the largest difference of the tuned cost, and of each 90 %
-    quantile, in percent of the smallest."""
-    result: dict[str, Any] = {}
-    for name in runs[0]["tuned_cost"]:
-        costs = np.array([run["tuned_cost"].get(name, np.nan) for run in runs])
-        mine = {"cost": float(100 * (costs.max() / costs.min() - 1))}
-        for figure in ("settled_error", "settling", "overshoot", "cost"):
-            values = np.array(
-                [
-                    run["contestants"][name][figure]["q90"] or np.inf
-                    for run in runs
-                    if name in run["contestants"]
-                ]
-            )
-            change = 100 * (values.max() / values.min() - 1) if np.isfinite(values).all() else np.inf
-            mine[f"q90_{figure}"] = float(change) if np.isfinite(change) else None
-        result[name] = mine
-    return result
-
-
-def cover(bands: Mapping[str, Any], runs: list[dict]) -> dict[str, Any]:
-    """The share of fresh runs inside each band, in percent: the mean over all bands and the smallest."""
-    shares = {}
-    for name, by_figure in bands.items():
-        for figure, by_end in by_figure.items():
-            band = by_end["q90"]
-            values = [run["contestants"].get(name, {}).get(figure, {}).get("q90") for run in runs]
-            low, high = (np.inf if band[key] is None else band[key] for key in ("low", "high"))
-            inside = [low <= (np.inf if value is None else value) <= high for value in values]
-            shares[f"{name}.{figure}"] = 100 * float(np.mean(inside))
-    return {
-        "fresh": len(runs),
-        "bands": len(shares),
-        "mean_percent": float(np.mean(list(shares.values()))),
-        "least_percent": float(min(shares.values())),
-        "least": min(shares, key=lambda key: shares[key]),
+def by_length(
+    runs: Mapping[int, Sequence[Mapping[str, Any]]], names: Sequence[str], seed: int
+) -> dict[str, Any]:
+    """The curve of cost against record length (`record_length.curves`, its bands over records) of the
+    controllers `names`, and the answers by length. A controller that was refused from one of a length's
+    records is missing at that length, with the reason."""
+    costs, refused = [], {}
+    for length, own in runs.items():
+        known = [name for name in names if all(name in run["costs"] for run in own)]
+        costs.append({name: np.array([run["costs"][name] for run in own]) for name in known})
+        refused[str(length)] = {name: why for run in own for name, why in run["refused"].items()}
+    pair = runs[list(runs)[-1]][0]["pair"]
+    curve = curves(costs, list(runs), (pair["a"], pair["b"]), seed=seed)
+    return curve | {
+        "refused": {length: why for length, why in refused.items() if why},
+        "answers": {str(length): answers(own) for length, own in runs.items()},
     }
 
 
@@ -166,56 +139,37 @@ def seeds(number: int) -> dict[str, int]:
 
 def many(count: int, first: int, changes: Mapping[str, Any], jobs: int) -> list[dict]:
     """`count` relearnings, everything drawn anew from seeds that begin with `first`."""
+    changes = {"evaluate_temperature.cost_curve": False, **changes}
     work = [seeds(first + k) for k in range(count)]
-    return list(
-        joblib.Parallel(n_jobs=jobs, return_as="generator")(
-            joblib.delayed(relearn)(drawn, changes) for drawn in work
-        )
-    )
-
-
-def tune_again(jobs: int) -> list[dict]:
-    """Five tuning seeds on the record that the parameters draw."""
-    return joblib.Parallel(n_jobs=jobs)(
-        joblib.delayed(relearn)({"tune_weights.seed": seed}, {}) for seed in range(1, 6)
-    )
+    return joblib.Parallel(n_jobs=jobs)(joblib.delayed(relearn)(drawn, changes) for drawn in work)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--relearnings", type=int, default=16)
-    parser.add_argument("--priors", type=int, default=4, help="relearnings without, and with more, prior")
-    parser.add_argument(
-        "--fresh", type=int, default=0, help="only: further relearnings against the file's bands"
-    )
+    parser.add_argument("--records", type=int, default=RECORDS, help="fresh records of each length")
     parser.add_argument("--jobs", type=int, default=2)
     chosen = parser.parse_args()
-    if chosen.fresh:
-        on_file = artifacts.read_json("datasets/papers/relearned.json")
-        runs = many(chosen.fresh, 9000, {}, chosen.jobs)
-        print(json.dumps(cover(on_file["contestants"], runs) | {"answers": answers(runs)}, indent=1))
-        return
-    runs = many(chosen.relearnings, 1000, {}, chosen.jobs)
     machine = params.read()["plant"]
-    result: dict[str, Any] = {
-        "command": COMMAND,
-        "machine": {
-            "outputs": [o["name"] for o in machine["outputs"]],
-            "sample_time_s": machine["sample_time_s"],
-        },
-        "relearnings": len(runs),
-        "holds_percent": 100 * (len(runs) - 1) / (len(runs) + 1),
-        "contestants": figures(runs),
-        "answers": answers(runs),
+    runs = {
+        length: many(chosen.records, 1000 * (k + 1), {"generate_probing.samples": length}, chosen.jobs)
+        for k, length in enumerate(LENGTHS)
     }
-    again = tune_again(chosen.jobs)
-    result["five_tuning_seeds"] = answers(again) | {"spread_percent": spread_percent(again)}
-    if chosen.priors:
-        result["prior"] = {
-            name: answers(many(chosen.priors, 1000, changes, chosen.jobs)) for name, changes in PRIORS.items()
-        }
-    files.write("relearned", result)
-    print(json.dumps({key: result.get(key) for key in ("answers", "five_tuning_seeds", "prior")}, indent=1))
+    priors = {
+        name: answers(many(PRIOR_RECORDS, 1000 * (LENGTHS.index(DEFAULT) + 1), changes, chosen.jobs))
+        for name, changes in PRIORS.items()
+    }
+    compared = [one.name for one in CONTROLLERS if one.kind in ("model-based", "data-driven")]
+    files.write(
+        "relearned",
+        {
+            "command": COMMAND,
+            "sample_time_s": machine["sample_time_s"],
+            "default": DEFAULT,
+            "records": chosen.records,
+            "curve": by_length(runs, compared, seed=1),
+            "prior": priors,
+        },
+    )
 
 
 if __name__ == "__main__":

@@ -62,8 +62,12 @@ def curve_sentence(figures: Figures) -> str:
     nothing was learned again from less of it."""
     compared = comparison(figures)
     curve, step = entry(compared, "cost_curve"), entry(compared, "sample_time_s")
-    if not isinstance(curve, Mapping):
-        return ""
+    return crossing_sentence(curve, step, "this record") if isinstance(curve, Mapping) else ""
+
+
+def crossing_sentence(curve: Mapping[str, Any], step: float, here: str) -> str:
+    """The same of a curve as record_length.curves has it; `step` is the sample time in seconds, and `here`
+    names the lengths that were tried."""
     a, b = curve["pair"]
     known = [
         (length, *costs)
@@ -75,21 +79,21 @@ def curve_sentence(figures: Figures) -> str:
         if None not in costs
     ]
     if len(known) < 2:
-        return "One of the pair could not be learned from less than this record."
+        return f"One of the pair could not be learned from less than {here}."
     minutes = [number(length * step / 60, 0) for length, *_ in known]
     ahead = [in_a_sentence(a if one < other else b) for _, one, other in known]
     crossing = curve["crossing"]
     if crossing["samples"] is None:
         return (
             f"{ahead[-1][:1].upper()}{ahead[-1][1:]} costs less at every length from {minutes[0]} to "
-            f"{minutes[-1]} min. The pair does not change places within this record."
+            f"{minutes[-1]} min. The pair does not change places within {here}."
         )
     at = number(crossing["samples"] * step / 60, 0)
     ends = [crossing[end] and crossing[end] * step / 60 for end in ("low", "high")]
     within = (
         f"90 % interval {band(*ends, 0) or number(ends[0], 0)} min"
         if None not in ends
-        else "its 90 % interval ends not within this record"
+        else f"its 90 % interval does not end within {here}"
     )
     return f"The pair changes places at {at} min ({within}): from there on {ahead[-1]} costs less."
 

@@ -1,6 +1,6 @@
 """papers.html: for each paper every table, every figure and every number that is a result, printed beside
 ours with its verdict; then our data in the papers' axes; the machine of Zavrakli 2023 counted in each way;
-and the temperature loop learned again from fresh records.
+and the temperature loop by the length of its record.
 
 All of ours is from files of the second pipeline, datasets/papers/dvc.yaml. Each says at which commit it was
 made and whether its method has changed since. No verdict, choice or export reads them.
@@ -16,8 +16,10 @@ from pipeline.report.papers.study import ranking
 from pipeline.report.shared import page
 from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
+from pipeline.report.temperature.pictures import cost_curve
 from pipeline.store import artifacts
 from pipeline.verdict.evidence import Absent, known
+from pipeline.verdict.pairs import crossing_sentence
 from pipeline.verdict.verdict import Missing
 
 # glyph of a verdict, by the states that the pages know
@@ -69,13 +71,27 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
         fails=FAILS,
         study=_results(others["reproduce_study"], "reproduce_study"),
         ranking=ranking,
-        relearned=_results(others["relearned"], "relearned"),
+        relearned=_by_length(others["relearned"]),
         made={name: made.sentence(name) for name in others},
     )
 
 
 @as_table()
+def _by_length(path: str) -> dict[str, Any]:
+    found = _read(path, "relearned")
+    finding = crossing_sentence(found["curve"], found["sample_time_s"], "these lengths")
+    return found | {
+        "finding": finding,
+        "picture": cost_curve(found["curve"], found["sample_time_s"], finding),
+    }
+
+
+@as_table()
 def _results(path: str, stage: str) -> dict[str, Any]:
+    return _read(path, stage)
+
+
+def _read(path: str, stage: str) -> dict[str, Any]:
     if not artifacts.exists(path):
         raise Absent(Missing("not measured", f"{path} is not there", f"Run {made.command(stage)}"))
     return artifacts.read_json(path)

@@ -2,6 +2,7 @@
 the record."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -155,7 +156,30 @@ def record_length(sources: Sources) -> Picture:
         off = "evaluate_temperature.cost_curve is false in params.expert.yaml"
         why = "No model-based or data-driven controller was learned" if curve else off
         raise Absent(Missing("not measured", why))
-    minutes = np.array(curve["samples"]) * sources.declared.machine.sample_time_s / 60
+    step, finding = sources.declared.machine.sample_time_s, curve_sentence(sources.metrics)
+    lacking = [
+        f"From {number(int(length) * step / 60, 0)} min {in_a_sentence(name)} cannot be learned: {why}."
+        for length, reasons in curve["refused"].items()
+        for name, why in reasons.items()
+    ]
+    return Picture(
+        finding,
+        [
+            PictureColumn(
+                "Cost", "learned from the beginning of the record", "", [cost_curve(curve, step, finding)]
+            )
+        ],
+        "Each controller learned again from the beginning of the record, its weights kept, on "
+        f"{curve['plants']} plants; bands: 90{THIN}% over plants. Nothing is said of longer records. "
+        f"{' '.join(lacking)}",
+        page.origin(sources.source("evaluate_temperature")),
+    )
+
+
+def cost_curve(curve: Mapping[str, Any], step: float, alt: str) -> Markup:
+    """Cost against the length of the record, as record_length.curves has it: a curve and a band a controller,
+    and the interval in which the pair changes places. `step` is the sample time in seconds."""
+    minutes = np.array(curve["samples"]) * step / 60
     named = {
         name: {key: np.array(values, float) for key, values in own.items()}
         for name, own in curve["controllers"].items()
@@ -175,7 +199,7 @@ def record_length(sources: Sources) -> Picture:
     layers = []
     crossing = entry(curve, "crossing") or {}
     if crossing.get("low"):
-        ends = (crossing[end] * sources.declared.machine.sample_time_s / 60 for end in ("low", "high"))
+        ends = (crossing[end] * step / 60 for end in ("low", "high"))
         layers.append(charts.interval(frame, *ends))
     for name, own in named.items():
         css = f"line {page.MARKS.get(name, '')}{' dash' if BY_NAME[name].hollow else ''}"
@@ -187,23 +211,8 @@ def record_length(sources: Sources) -> Picture:
         )
         last = np.flatnonzero(known)[-1]
         layers.append(charts.label(frame, minutes[last], own["cost"][last], heading(name), dx=6, dy=4))
-    lacking = [
-        f"From {number(int(length) * sources.declared.machine.sample_time_s / 60, 0)} min "
-        f"{in_a_sentence(name)} cannot be learned: {why}."
-        for length, reasons in curve["refused"].items()
-        for name, why in reasons.items()
-    ]
-    finding = curve_sentence(sources.metrics)
-    drawn_picture = charts.panel(
-        frame, layers, alt=finding, css="mb wide", title="cost, log", across="minutes of the record, log"
-    )
-    return Picture(
-        finding,
-        [PictureColumn("Cost", "learned from the beginning of the record", "", [drawn_picture])],
-        "Each controller learned again from the beginning of the record, its weights kept, on "
-        f"{curve['plants']} plants; bands: 90{THIN}% over plants. Nothing is said of longer records. "
-        f"{' '.join(lacking)}",
-        page.origin(sources.source("evaluate_temperature")),
+    return charts.panel(
+        frame, layers, alt=alt, css="mb wide", title="cost, log", across="minutes of the record, log"
     )
 
 
