@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report.deposition.parts import KIND, MARK, draw_flows, lines_of, real
+from pipeline.report.deposition.parts import KIND, MARK, draw_flows, flow_key, lines_of, real
 from pipeline.report.shared import page
 from pipeline.report.shared.card import (
     PICTURE,
@@ -166,15 +166,11 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     part = found[1]
     stretch = {key: table[key][rows] for key in table}
     drawn = [name for name in names if np.isfinite(stretch.get(f"{name}_mm3_per_s", np.nan)).any()]
-    listed = ", ".join(f"{i} {NAMES[name].lower()}" for i, name in enumerate(drawn, 1) if name in part.scores)
-    finding = (
-        f"{part.part}, material {part.material}, about the largest error; dashed: wanted flow. {listed}."
-    )
-
+    finding = f"{part.part}, material {part.material}, about the largest error:"
     return Deciding(
         finding,
         draw_flows(stretch, drawn, finding, PICTURE),
-        "",
+        flow_key(drawn),
         page.in_viewer("signals", part=[part.part], material=[part.material], y=lines_of(drawn)),
     )
 

@@ -247,8 +247,7 @@ def stretches(sources: Sources) -> Picture:
         "a full line’s, r.m.s.",
         shown,
         f"{'Forecast' if real(sources) else 'True'} flow in mm³/s against time in s, "
-        f"the {STRETCH_S:g} s around the largest error of the signal that was chosen; dashed: wanted; "
-        f"{', '.join(f'{k} {NAMES[name].lower()}' for k, name in enumerate(names, 1))}.",
+        f"the {STRETCH_S:g} s around the largest error of the signal that was chosen: " + flow_key(names),
         page.origin(sources.source("signals"), y=lines_of(names)),
     )
 
@@ -294,10 +293,15 @@ def _stretch(table: Table, part: str, material: str, chosen: str) -> Stretch:
     )
 
 
+def flow_key(names: Sequence[str]) -> Markup:
+    """Which line is whose in `draw_flows`."""
+    return page.line_key([("wanted", "ref"), *((NAMES[name].lower(), LINE[name]) for name in names)])
+
+
 def _panel(stretch: Stretch, names: list[str]) -> Markup:
     off = ", ".join(
-        f"{k} {NAMES[name].lower()} {percent(stretch.off(name), 2)}{' (chosen)' * (name == stretch.chosen)}"
-        for k, name in enumerate(names, 1)
+        f"{NAMES[name].lower()} {percent(stretch.off(name), 2)}{' (chosen)' * (name == stretch.chosen)}"
+        for name in names
     )
     table = {f"{name}_mm3_per_s": stretch.flows[name] for name in names}
     table |= {"time_s": stretch.t, "wanted_mm3_per_s": stretch.wanted}
@@ -308,7 +312,7 @@ def _panel(stretch: Stretch, names: list[str]) -> Markup:
 def draw_flows(
     table: Mapping[str, np.ndarray], names: Sequence[str], alt: str, size: tuple[int, int]
 ) -> Markup:
-    """Flow of the composers over one another, each with its number, and dashed the wanted one."""
+    """Flow of the composers over one another, and the wanted one."""
     flows = {name: table[f"{name}_mm3_per_s"] for name in ("wanted", *names)}
     finite = np.concatenate([values[np.isfinite(values)] for values in flows.values()])
     room = 0.06 * float(np.ptp(finite)) or 1.0
@@ -319,16 +323,7 @@ def draw_flows(
         *size, 40, 34, 22, 14,
     )  # fmt: skip
     layers = [charts.line(frame, time, flows["wanted"], "ref", most=120)]
-    for i, name in enumerate(names, 1):
-        y = flows[name]
-        if not np.isfinite(y).any():
-            continue
-        layers.append(charts.line(frame, time, y, LINE[name], most=120))
-        # a number where the line is furthest from the wanted flow, each in a stretch of its own
-        first, last = ((len(time) * k) // len(names) for k in (i - 1, i))
-        off = np.nan_to_num(np.abs(y - flows["wanted"])[first:last])
-        at = first + int(np.argmax(off))
-        layers.append(charts.label(frame, time[at], y[at], str(i), dx=5, dy=-4))
+    layers += [charts.line(frame, time, flows[name], LINE[name], most=120) for name in names]
     return charts.panel(
         frame, layers, alt=alt, css="mb lead-picture", title="flow, mm³/s", across="time, s",
         units=("s", "mm³/s"),
@@ -352,13 +347,13 @@ def by_prints(sources: Sources) -> Picture:
     ]
     if not columns:
         raise Absent(Missing("not measured", "No simulated machine tells it"))
-    listed = ", ".join(f"{k} {NAMES[name].lower()}" for k, name in enumerate(drawn, 1))
+    key = page.line_key([*((NAMES[name].lower(), LINE[name]) for name in drawn), ("limit", "lim")])
     return Picture(
         pair_sentence(sources.evidence).note,
         columns,
-        "Flow error in % of on\u2011off control’s against prints, both log scale; grey line: the limit. "
-        f"{listed[:1].upper()}{listed[1:]}. Prints are those of training routines of the material, and for "
-        f"“{NAMES[REFERENCE].lower()}” those of the part itself.",
+        key
+        + ". Flow error in % of on\u2011off control’s against prints, both log scale. Prints are those of "
+        f"training routines of the material, and for “{NAMES[REFERENCE].lower()}” those of the part itself.",
         page.origin(sources.source("prints")),
     )
 
@@ -376,13 +371,12 @@ def _spent_panel(rows: pd.DataFrame, names: Sequence[str], sources: Sources) -> 
         368, 190, 34, 34, 22, 30,
     )  # fmt: skip
     layers, ends = [charts.level(frame, limit, "lim")], []
-    for k, name in enumerate(names, 1):
+    for name in names:
         mine = rows[rows.composer == name].sort_values("prints")
         if mine.empty:
             continue
         x, y = mine.prints.to_numpy(float), mine.rms_percent_of_on_off.to_numpy(float)
         layers.append(charts.line(frame, x, y, LINE[name]))
-        layers.append(charts.label(frame, x[-1], y[-1], str(k), dx=4, dy=4))
         ends.append(f"{NAMES[name]} {percent(float(y[-1]), 2)} after {int(x[-1])}")
     return charts.panel(
         frame, layers, alt=f"Flow error by prints: {', '.join(ends)}", css="mb lead-picture",
@@ -493,7 +487,7 @@ LINE = {
     "pressure_advance": "line bl dash",
     "pressure_advance_lead": "line bl dash",
     "on_off": "line bl",
-    "ilc": "line dash",
+    "ilc": "line dd dots",
 }
 # what the two columns of its rules are, the mark of the second and that of the first
 HEADS = ("Model\u2011based", "Data\u2011driven", "data_driven", "model_based")

@@ -16,7 +16,7 @@ from pipeline.report.papers.study import ranking
 from pipeline.report.shared import page
 from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature.pictures import cost_curve
+from pipeline.report.temperature.pictures import cost_curve, cost_key
 from pipeline.store import artifacts
 from pipeline.verdict.evidence import Absent, known
 from pipeline.verdict.pairs import crossing_sentence
@@ -79,11 +79,9 @@ def render(sources: Sources, files: Mapping[str, tuple[str, str]], others: Mappi
 @as_table()
 def _by_length(path: str) -> dict[str, Any]:
     found = _read(path, "relearned")
-    finding = crossing_sentence(found["curve"], found["sample_time_s"], "these lengths")
-    return found | {
-        "finding": finding,
-        "picture": cost_curve(found["curve"], found["sample_time_s"], finding),
-    }
+    curve, step = found["curve"], found["sample_time_s"]
+    finding = crossing_sentence(curve, step, "these lengths")
+    return found | {"finding": finding, "picture": cost_curve(curve, step, finding), "key": cost_key(curve)}
 
 
 @as_table()

@@ -167,9 +167,9 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     return Deciding(
         f"Runs that {does} in {within(first)}: {listed}.",
         need(deciding_case.panel(sources, scores, first, names)),
-        f"Median and {high - low}{THIN}% of the runs; dashed: ±{FLOW_BAND:g}{THIN}%.",
+        deciding_case.key(scores, names)
+        + f". Median and {high - low}{THIN}% of the runs; dashed: ±{FLOW_BAND:g}{THIN}%.",
         page.linked(sources.source("paths"), short=True),
-        [entrant(role(scores, name), name) for name in names],
     )
 
 

@@ -14,7 +14,7 @@ from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND
 from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
-from pipeline.verdict.digits import THIN, count, number, shortened
+from pipeline.verdict.digits import THIN, count, number
 from pipeline.verdict.evidence import Absent, Table, need, or_gap
 from pipeline.verdict.setpoint import Board, Case, case_text, role, worst
 from pipeline.verdict.verdict import Missing
@@ -27,7 +27,7 @@ MIDDLE = (10, 90)
 # float32 sums of moves end a hair outside a border that they are on
 ROUNDING = 1e-3
 # width, height and the room left, below, above and right of a panel, in px
-SIZE = (568, 300, 34, 20, 22, 12)
+SIZE = (568, 300, 34, 34, 22, 12)
 
 
 class Trace(NamedTuple):
@@ -120,10 +120,12 @@ def picture(sources: Sources, board: Board | Missing) -> Picture:
             PictureColumn("Flow", "per cent, against decisions", "", [flow]),
             PictureColumn("Runs inside", "per cent of them, against decisions", "", [share]),
         ],
-        f"One run from each of {starts}, on the first pool of segments. {reading(found.runs)} Dashed: "
+        key(board, found.runs)
+        + f". One run from each of {starts}, on the first pool of segments. {reading(found.runs)} Dashed: "
         f"{BEST_FLOW - FLOW_BAND:g}–{BEST_FLOW + FLOW_BAND:g}{THIN}%. Inside: there, and "
-        f"{BEST_TEMPERATURE:g}{THIN}±{THIN}{TEMPERATURE_BAND:g}{THIN}°C. What lies beyond the axis is not "
-        "drawn.",
+        f"{BEST_TEMPERATURE:g}{THIN}±{THIN}{TEMPERATURE_BAND:g}{THIN}°C; grey: "
+        f"{sources.declared.rules.settled_percent:g}{THIN}% of the runs are to settle. What lies beyond the "
+        "axis is not drawn.",
         page.origin(sources.source("paths"), simulator=case[0], case=case[1], controller=list(found.runs)),
         title=case_text(case, whole=True),
     )
@@ -134,7 +136,7 @@ def panel(sources: Sources, board: Board, case: Case, names: Sequence[str]) -> M
     """The flow of these controllers in a case, as page one draws it; why there is none."""
     found = need(traces(sources.tables["paths"], case, names))
     frame = charts.Frame(_decisions(found), FLOW, *PICTURE, 34, 34, 16, 14)
-    return _flow(board, found, frame, alt=finding(found), page_one=True)
+    return _flow(board, found, frame, alt=finding(found))
 
 
 def reading(names: Iterable[str]) -> str:
@@ -166,9 +168,13 @@ def _decisions(found: Traces) -> charts.Axis:
     return charts.linear(0, max(found.last, 1), ticks=5)
 
 
-def _flow(board: Board, found: Traces, frame: charts.Frame, *, alt: str, page_one: bool = False) -> Markup:
-    """Median and middle of the runs of everybody who acts, and each run that is left alone. On page one the
-    marks stand below the picture."""
+def key(board: Board, names: Iterable[str]) -> Markup:
+    """Which line is whose in these pictures."""
+    return page.line_key(page.line_styles({name: role(board, name) for name in names}).items())
+
+
+def _flow(board: Board, found: Traces, frame: charts.Frame, *, alt: str) -> Markup:
+    """Median and middle of the runs of everybody who acts, and each run that is left alone."""
     layers: list[Markup] = []
     styles = page.line_styles({name: role(board, name) for name in found.runs})
     # what is left alone lies behind, the default in front
@@ -184,13 +190,10 @@ def _flow(board: Board, found: Traces, frame: charts.Frame, *, alt: str, page_on
         layers.append(charts.line(frame, *corners(np.median(flow, axis=0)), styles[name]))
     layers += [charts.level(frame, BEST_FLOW + border, "ref") for border in (-FLOW_BAND, FLOW_BAND)]
     layers += _event(frame, found.clog)
-    if page_one:
-        return charts.panel(
-            frame, layers, alt=alt, css="mb lead-picture", title="flow, %", across="decisions",
-            units=("decisions", "%"),
-        )  # fmt: skip
-    layers += _key(frame, board, found)
-    return charts.panel(frame, layers, alt=alt, css="mb wide", title="flow, %", units=("decisions", "%"))
+    return charts.panel(
+        frame, layers, alt=alt, css="mb lead-picture", title="flow, %", across="decisions",
+        units=("decisions", "%"),
+    )  # fmt: skip
 
 
 def corners(*lines: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -205,19 +208,20 @@ def _inside(board: Board, found: Traces, limit: float) -> Markup:
     """The share of the runs that are inside, decision by decision."""
     y = charts.Axis(0, 104, tuple((float(v), str(v)) for v in (0, 25, 50, 75, 100)))
     frame = charts.Frame(_decisions(found), y, *SIZE)
-    layers = [charts.level(frame, limit, "lim", f"to settle: {limit:g}", above=False)]
+    layers = [charts.level(frame, limit, "lim")]
     styles, ends = page.line_styles({name: role(board, name) for name in found.runs}), []
     for name in reversed(list(found.runs)):
         share = 100 * found.runs[name].inside.mean(axis=0)
         layers.append(charts.line(frame, *corners(share), styles[name], steps=True))
         ends.append(f"{name} {number(float(share[-1]), 0)} %")
-    layers += [*_event(frame, found.clog), *_key(frame, board, found)]
+    layers += _event(frame, found.clog)
     return charts.panel(
         frame,
         layers,
         alt=f"Runs inside at the end: {', '.join(ends[::-1])}; {limit:g} % are to settle",
-        css="mb wide",
+        css="mb lead-picture",
         title="inside, %",
+        across="decisions",
         units=("decisions", "%"),
     )
 
@@ -233,15 +237,3 @@ def _event(frame: charts.Frame, happens: Clog | None) -> list[Markup]:
         bar.format(x, frame.above, frame.height - frame.below),
         charts.label(frame, happens.step, frame.y.high, text, dx=4, dy=10),
     ]
-
-
-def _key(frame: charts.Frame, board: Board, found: Traces) -> list[Markup]:
-    """Marks and names above the panel, from the right, 7 px a letter."""
-    layers, x = [], frame.width - frame.right
-    for name in reversed(list(found.runs)):
-        text = shortened(name, 24)
-        x -= 7 * len(text)
-        layers.append(Markup('<text x="{}" y="9">{}</text>').format(x, text))
-        layers.append(charts.mark(page.MARKS[role(board, name)], f"{x - 8}", 5.5))
-        x -= 24
-    return layers

@@ -37,14 +37,13 @@ PICTURE = (332, 124)
 
 
 class Deciding(NamedTuple):
-    """The case that decides a loop as a picture in which its controllers lie over one another. `entrants`
-    are those whose marks it shows; `key` says how to read it; `origin` leads to its data."""
+    """The case that decides a loop as a picture in which its controllers lie over one another. `key` says
+    which line is whose and what else there is to read; `origin` leads to its data."""
 
     finding: str
     drawn: Markup
-    key: str
+    key: Markup
     origin: Markup
-    entrants: Sequence[dict[str, str]] = ()
 
 
 NEXT = re.compile(r"(?<=[.!?]) (?=[A-Z])")
@@ -61,6 +60,7 @@ def first_sentence(text: str, room: int = ROOM) -> str:
 def of_verdict(verdict: Verdict, moves: str, step: dict[str, str], **rest: Any) -> Card:
     """The card of a loop with this verdict. `rest`: its entrants and rows; `basis` says what the small
     figures are; `picture` is the case that decides, or why there is none; `cost` is what the data cost;
+    `beside` sets a simple controller beside it;
     `sources`; or `missing`, why there are no figures."""
     return {
         "loop": verdict.loop,
@@ -71,6 +71,7 @@ def of_verdict(verdict: Verdict, moves: str, step: dict[str, str], **rest: Any) 
         "reason": first_sentence(verdict.reason),
         "answer": verdict.short_answer,
         "step": step,
+        "beside": "",
         "missing": "",
     } | rest
 

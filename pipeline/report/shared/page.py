@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import re
 import urllib.parse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import jinja2
 from markupsafe import Markup, escape
@@ -160,6 +160,15 @@ def line_styles(marks: Mapping[str, str]) -> dict[str, str]:
         style = STYLES.get(MARKS.get(role, "bl"), "line")
         styles[name] = f"{style} dash" if style in styles.values() else style
     return styles
+
+
+def line_key(lines: Iterable[tuple[str, str]]) -> Markup:
+    """Which line of a picture is whose: of each (name, class of its line) a stroke, and the name."""
+    stroke = Markup(
+        '<span class="ln"><svg class="plot stroke" viewBox="0 0 20 8" aria-hidden="true"><path class="{}" '
+        'd="M0 4H20"/></svg> {}</span>'
+    )
+    return Markup(", ").join(stroke.format(css, name) for name, css in lines)
 
 
 def bdi(text: object) -> Markup:

@@ -12,10 +12,11 @@ from pipeline.report.shared import charts, page
 from pipeline.report.shared.card import PICTURE, Card, Deciding, cell, entrant, of_verdict, step
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.judgement import Judgement
-from pipeline.report.temperature.pictures import IDLE, contestants, runs_of, until_settled
+from pipeline.report.temperature.pictures import IDLE, PI, contestants, runs_of, until_settled
 from pipeline.verdict.controllers import heading
-from pipeline.verdict.digits import THIN, count, short
+from pipeline.verdict.digits import THIN, count, number, short
 from pipeline.verdict.evidence import Table, entry, gap_of, need, need_figure, or_gap, or_nothing
+from pipeline.verdict.temperature import comparison, finite
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, Verdict, state
 from pipeline.verdict.wording import OFF_THE_SCALE, banded, limit_text, places_of, worded
 
@@ -44,6 +45,7 @@ def card(sources: Sources, judged: Judgement, verdict: Verdict) -> Card:
         ],
         rows=[_row(asked[key], judged, list(names)) for key in keys if key in asked] if told else [],
         basis=f"90{THIN}% quantile; small: 90{THIN}% band",
+        beside=beside_plain(sources, judged),
         cost=_cost(sources),
         picture=deciding(sources, judged),
         sources=sources.source("evaluate_temperature"),
@@ -63,6 +65,19 @@ def failure(judged: Judgement, name: str, shown: Sequence[str]) -> str:
         return ""
     # "Margin: disk, of the weakest tenth" -> "disk margin"
     return f"; fails {' '.join(reversed(failed[0].title.split(', ')[0].lower().split(': ')))}"
+
+
+def beside_plain(sources: Sources, judged: Judgement) -> str:
+    """What a PI by SIMC's rules, which nobody tuned, costs beside the subject of the verdict, and the first
+    rule that it fails; "" if it is the subject or was not judged."""
+    plain = PI[0]
+    compared = entry(comparison(sources.metrics), "contestants") or {}
+    ours, theirs = (finite(entry(compared, name, "cost", "median")) for name in (judged.subject, plain))
+    if judged.subject == plain or not ours < math.inf > theirs:
+        return ""
+    less = 100 * (1 - theirs / ours)
+    amount = f"{number(abs(less), 0)}{THIN}% {'less' if less > 0 else 'more'}"
+    return f"A plain PI (SIMC) costs {amount}{failure(judged, plain, ())}."
 
 
 @or_nothing
@@ -146,25 +161,25 @@ def deciding(
     early = {who: rows[table["time_s"][rows] <= seconds] for who, rows in runs.items()}
     label = sources.zone([o.name for o in sources.declared.machine.outputs].index(zone))
     off = np.abs(table[zone] - table[f"{zone}_reference"])
-    listed = ", ".join(
-        f"{i} {heading(who)} {short(float(off[rows[-1]]), 2)}"
-        for i, (who, rows) in enumerate(early.items(), 1)
-    )
-    finding = f"{lead}In °C, {label} is off its reference after {short(seconds, 2)} s by: {listed}."
-    finding = f"{finding} Grey: the limit."
+    finding = f"{lead}By how much {label} is off its reference after {short(seconds, 2)} s, in °C"
+    left = {who: f"{heading(who)} {short(float(off[rows[-1]]), 2)}" for who, rows in early.items()}
+    styles, limit = page.line_styles({who: who for who in runs}), sources.declared.rules.settled_error_degC
+    key = page.line_key([*((left[who], styles[who]) for who in left), (f"limit {limit:g}", "lim")])
+    alt = f"{finding}: {', '.join(left.values())}."
     return Deciding(
-        finding,
-        _drawn(table, early, zone, sources.declared.rules.settled_error_degC, finding, size),
-        "",
+        f"{finding}:",
+        _drawn(table, early, zone, limit, alt, size, styles),
+        key,
         page.in_viewer("trajectories", case_name=["deciding"], contestant=list(runs), y=[zone]),
     )
 
 
 def _drawn(
-    table: Table, runs: dict[str, np.ndarray], zone: str, limit: float, alt: str, size: tuple[int, int]
-) -> Markup:
-    """By how much the zone is off its reference, log scale, the controllers over one another, each with its
-    number; the grey line is the limit of the settled error."""
+    table: Table, runs: dict[str, np.ndarray], zone: str, limit: float, alt: str, size: tuple[int, int],
+    styles: dict[str, str],
+) -> Markup:  # fmt: skip
+    """By how much the zone is off its reference, log scale, the controllers over one another; the level
+    line is the limit of the settled error."""
     time, rows = table["time_s"], np.concatenate(list(runs.values()))
     off = np.abs(table[zone] - table[f"{zone}_reference"])
     finite = off[rows][np.isfinite(off[rows])]
@@ -174,13 +189,9 @@ def _drawn(
         charts.linear(0, float(time[rows].max()) or 1.0), charts.Axis(0.01, most, ticks, True),
         *size, 40, 34, 22, 14,
     )  # fmt: skip
-    layers, styles = [charts.level(frame, limit, "lim")], page.line_styles({who: who for who in runs})
-    for i, (who, mine) in enumerate(runs.items(), 1):
-        y = np.maximum(off[mine], 0.01)
-        layers.append(charts.line(frame, time[mine], y, styles[who], most=120))
-        # a number of its own height each, where the line comes by
-        at = int(np.argmax(np.log(y) <= np.log(y[0]) + (np.log(0.1) - np.log(y[0])) * i / (len(runs) + 1)))
-        layers.append(charts.label(frame, time[mine[at]], y[at], str(i), dx=5, dy=4))
+    layers = [charts.level(frame, limit, "lim")]
+    for who, mine in runs.items():
+        layers.append(charts.line(frame, time[mine], np.maximum(off[mine], 0.01), styles[who], most=120))
     return charts.panel(
         frame, layers, alt=alt, css="mb lead-picture", title="off the reference, °C, log", across="time, s",
         units=("s", "°C"),

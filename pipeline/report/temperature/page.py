@@ -47,7 +47,7 @@ def worst_zone(sources: Sources, judged: Judgement) -> Picture:
     """The controllers over one another in the case that decides: the error of the worst zone."""
     found = need(deciding(sources, judged, (566, 230)))
     column = PictureColumn("", "", "", [found.drawn])
-    return Picture(found.finding, [column], "", found.origin)
+    return Picture(found.finding, [column], found.key, found.origin)
 
 
 def render(sources: Sources, judged: Judgement) -> str:

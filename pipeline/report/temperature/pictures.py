@@ -169,7 +169,8 @@ def record_length(sources: Sources) -> Picture:
                 "Cost", "learned from the beginning of the record", "", [cost_curve(curve, step, finding)]
             )
         ],
-        "Each controller learned again from the beginning of the record, its weights kept, on "
+        cost_key(curve)
+        + ". Each controller learned again from the beginning of the record, its weights kept, on "
         f"{curve['plants']} plants; bands: 90{THIN}% over plants. Nothing is said of longer records. "
         f"{' '.join(lacking)}",
         page.origin(sources.source("evaluate_temperature")),
@@ -180,15 +181,15 @@ def cost_curve(curve: Mapping[str, Any], step: float, alt: str) -> Markup:
     """Cost against the length of the record, as record_length.curves has it: a curve and a band a controller,
     and the interval in which the pair changes places. `step` is the sample time in seconds."""
     minutes = np.array(curve["samples"]) * step / 60
+    styles = cost_styles(curve)
     named = {
-        name: {key: np.array(values, float) for key, values in own.items()}
-        for name, own in curve["controllers"].items()
-        if any(value is not None for value in own["cost"])
+        name: {key: np.array(values, float) for key, values in curve["controllers"][name].items()}
+        for name in styles
     }
     every = np.concatenate([values for own in named.values() for values in own.values()])
     ticks = tuple((float(value), number(float(value), 0)) for value in minutes)
     frame = charts.Frame(
-        charts.Axis(minutes[0] / 1.2, minutes[-1] * 1.9, ticks, log=True),
+        charts.Axis(minutes[0] / 1.2, minutes[-1] * 1.1, ticks, log=True),
         _costs(every[np.isfinite(every)]),
         width=720,
         height=220,
@@ -202,18 +203,34 @@ def cost_curve(curve: Mapping[str, Any], step: float, alt: str) -> Markup:
         ends = (crossing[end] * step / 60 for end in ("low", "high"))
         layers.append(charts.interval(frame, *ends))
     for name, own in named.items():
-        css = f"line {page.MARKS.get(name, '')}{' dash' if BY_NAME[name].hollow else ''}"
         known = np.isfinite(own["cost"])
-        layers.append(charts.ribbon(frame, minutes[known], own["low"][known], own["high"][known]))
-        layers.append(charts.line(frame, minutes[known], own["cost"][known], css))
+        layers.append(
+            charts.ribbon(
+                frame,
+                minutes[known],
+                own["low"][known],
+                own["high"][known],
+                f"ribbon {page.MARKS.get(name, '')}",
+            )
+        )
+        layers.append(charts.line(frame, minutes[known], own["cost"][known], styles[name]))
         layers.append(
             charts.dots(frame, minutes[known], own["cost"][known], f"dot {page.MARKS.get(name, '')}")
         )
-        last = np.flatnonzero(known)[-1]
-        layers.append(charts.label(frame, minutes[last], own["cost"][last], heading(name), dx=6, dy=4))
     return charts.panel(
-        frame, layers, alt=alt, css="mb wide", title="cost, log", across="minutes of the record, log"
+        frame, layers, alt=alt, css="mb lead-picture", title="cost, log", across="minutes of the record, log"
     )
+
+
+def cost_key(curve: Mapping[str, Any]) -> Markup:
+    """Which line is whose in `cost_curve`."""
+    return page.line_key((heading(name), css) for name, css in cost_styles(curve).items())
+
+
+def cost_styles(curve: Mapping[str, Any]) -> dict[str, str]:
+    """By controller with a known cost the class of its line."""
+    drawn = [name for name, own in curve["controllers"].items() if any(v is not None for v in own["cost"])]
+    return page.line_styles({name: name for name in drawn})
 
 
 def runs_of(sources: Sources, judged: Judgement, table: Table) -> tuple[dict[str, np.ndarray], str]:

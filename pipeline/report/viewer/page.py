@@ -108,7 +108,7 @@ def still(sources: Sources, judged: Judgement) -> dict[str, Any]:
     """What stands where no script runs: the deciding case of the temperature loop, as page one draws it."""
     found = need(deciding(sources, judged, (360, 240), "The deciding case: "))
     return {
-        "text": found.finding,
+        "text": Markup("{} {}").format(found.finding, found.key),
         "picture": found.drawn,
         "origin": page.files(sources.source("trajectories")),
     }
