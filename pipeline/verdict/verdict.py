@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.store import artifacts
-from pipeline.verdict.digits import decimals
 
 PASSED, FAILED, UNDECIDED, OPEN = "passed", "failed", "undecided", "not measured"
 # a rule that cannot be judged before somebody declares what it asks about
@@ -71,18 +70,6 @@ def state(question: Question, figure: Figure | Missing) -> str:
     best, worst = (figure.high, figure.low) if question.at_least else (figure.low, figure.high)
     inside = (lambda end: end >= question.limit) if question.at_least else (lambda end: end <= question.limit)
     return PASSED if inside(worst) else UNDECIDED if inside(best) else FAILED
-
-
-def row_places(question: Question, figures: Sequence[Figure | Missing]) -> int:
-    """One number of decimals for a row: what the widest band supports,
-    but enough to show the smallest value at all."""
-    mine = [(f, decimals(f.low, f.high, value=f.value)) for f in figures if isinstance(f, Figure)]
-    if question.key == "data":
-        return 0 if all(f.value >= 10 for f, _ in mine) else 2
-    if not mine:
-        return decimals(0, 0, value=question.limit)
-    places = min(own for _, own in mine)
-    return max([places, *(own for f, own in mine if f.value and round(f.value, places) == 0)])
 
 
 def share(question: Question, value: float) -> float:

@@ -2,29 +2,47 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 from pipeline.verdict.controllers import in_a_sentence
-from pipeline.verdict.digits import band, beyond_meaning, declared, quantity, with_unit
-from pipeline.verdict.verdict import Figure, Missing, Question, row_places
+from pipeline.verdict.digits import band, beyond_meaning, decimals, declared, quantity, with_unit
+from pipeline.verdict.verdict import Figure, Missing, Question
 
 OFF_THE_SCALE = "off the scale"
 # what an infinite figure is called
 INFINITE = {"settling": "never settles", "disk": "unlimited", "delay_s": "unlimited", "data": "unlimited"}
+MOST_PLACES = 6
 
 
 def places_of(question: Question, figures: Sequence[Figure | Missing]) -> int:
-    """Decimals of a row: as its bands support, two at most, but enough to show the smallest figure at all."""
-    places = row_places(question, figures)
-    small = [f.value for f in figures if isinstance(f, Figure) and f.value and round(f.value, 2) == 0]
-    return places if small else min(places, 2)
+    """Decimals of a row: what its narrowest band supports, two unless a figure has less than two digits then,
+    and as many as tell apart any two figures whose bands do not meet."""
+    known = [f for f in figures if isinstance(f, Figure) and not _out_of_words(f.value, question.unit)]
+    if question.key == "data":
+        return 0 if all(f.value >= 10 for f in known) else 2
+    if not known:
+        return min(decimals(0, 0, value=question.limit), 2)
+    supported = max(decimals(f.low, f.high, value=f.value) for f in known)
+    smallest = min((abs(f.value) for f in known if f.value), default=1.0)
+    places = min(supported, max(2, 1 - math.floor(math.log10(smallest))))
+    known.sort(key=lambda figure: figure.value)
+    while places < MOST_PLACES and any(
+        a.high < b.low and round(a.value, places) == round(b.value, places) for a, b in pairwise(known)
+    ):
+        places += 1
+    return places
+
+
+def _out_of_words(value: float, unit: str) -> bool:
+    return math.isinf(value) or bool(beyond_meaning(value, unit)) or abs(value) > 1e4
 
 
 def worded(question: Question, value: float, places: int) -> str:
     """A figure with its unit; in words where its digits say nothing."""
     if math.isinf(value):
         return INFINITE.get(question.key, "unstable")
-    if beyond_meaning(value, question.unit) or abs(value) > 1e4:
+    if _out_of_words(value, question.unit):
         return OFF_THE_SCALE
     return quantity(value, question.unit, places)
 

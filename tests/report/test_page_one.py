@@ -181,12 +181,18 @@ def test_a_contestant_that_fails_a_rule_which_the_card_does_not_show_says_so_und
     assert told == {"low": "; fails disk margin", "bad": "", "good": "", "none": ""}
 
 
+def lines_listed(told):
+    """(name, value) of each controller below the deciding picture."""
+    listed = told[told.index("in °C:") + 6 : told.index("limit")]
+    return re.findall(r" ([A-Za-z+, ]+?) (\d[\d.]*) ?,", listed)
+
+
 def test_the_deciding_picture_tells_the_last_values_that_it_draws(reports, first):
     runs = pd.read_parquet(reports.parent / "datasets/evaluate_temperature/trajectories.parquet")
     deciding = runs[runs.case_name == "deciding"]
     told = first.text[first.text.index("is off its reference after") :]
-    seconds = float(re.search(r"after ([\d.]+)\u202f? ?s by", told)[1])
-    listed = dict(re.findall(r"\d ([A-Za-z+, ]+?) (\d[\d.]*)[,.]", told.split("Deciding")[0]))
+    seconds = float(re.search(r"after ([\d.]+) s, in °C", told)[1])
+    listed = dict(lines_listed(told))
     zones = [name for name in runs if f"{name}_reference" in runs]
     for shown, name in (("subspace + LQG", "subspace_lqg"), ("learned kernel", "learned_kernel")):
         mine = deciding[(deciding.contestant == name) & (deciding.time_s <= 1.05 * seconds)]
@@ -197,9 +203,9 @@ def test_the_deciding_picture_tells_the_last_values_that_it_draws(reports, first
 
 def test_the_deciding_picture_draws_whom_the_table_beside_it_shows(cards):
     card = cards["temperature"]
-    listed = re.findall(r"\d ([A-Za-z+, ]+?) \d[\d.]*[,.]", card[card.index("is off its reference") :])
+    listed = lines_listed(card[card.index("is off its reference") :])
     heads = card[: card.index("Settled error")]
-    assert len(listed) == 3 and all(name in heads for name in listed), (listed, heads)
+    assert len(listed) == 3 and all(name in heads for name, _ in listed), (listed, heads)
 
 
 def test_what_changed_is_counted_for_every_loop(first):

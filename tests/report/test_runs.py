@@ -67,12 +67,12 @@ def test_the_page_is_a_function_of_what_it_reads_equal_bytes_in_two_clones(
     assert RUNS.read_bytes() == here
 
 
-def test_figures_stand_beside_the_accepted_ones_with_bands_and_digits_that_bands_support(accepted):
+def test_figures_stand_beside_the_accepted_ones_with_bands_and_the_same_digits(accepted):
     change("evaluate_temperature", contestants__subspace_lqg__settling=made.figure(9.04, 8.51, 9.52))
     main()
     text = Page(RUNS).text
     # 5 to 8 before, 8.5 to 9.5 now
-    assert "Settling at most 60 s 6 s 5–8 9.0 s 8.5–9.5 +3 s · worse" in text
+    assert "Settling at most 60 s 6.0 s 5.0–8.0 9.0 s 8.5–9.5 +3 s · worse" in text
     assert "Cost as deployed none 2.00 1.80–2.20 2.00 1.80–2.20 unchanged" in text
     assert text.count("subspace + LQG") >= 2
     assert "1 of 23 figures moved beyond their noise." in text

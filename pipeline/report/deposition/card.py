@@ -118,22 +118,26 @@ def _row(
     each = {name: [value for part in parts if (value := read(part, name)) is not None] for name in names}
     most = [max(values) if values else None for values in each.values()]
     best = best_of(most, at_least=False)
+    places = max((_places(values) for values in each.values() if values), default=0)
     limit_text = f"{sign}{'' if sign == '±' else ' '}{limit:g}{THIN}{unit}"
     return {
         "title": title,
         "limit": limit_text,
         "cells": [
-            _cell(values, unit, best=max(values, default=None) == best is not None, limit=limit)
+            _cell(values, unit, places, best=max(values, default=None) == best is not None, limit=limit)
             for values in each.values()
         ],
     }
 
 
-def _cell(values: Sequence[float], unit: str, *, best: bool, limit: float) -> dict[str, Any]:
+def _places(values: Sequence[float]) -> int:
+    return min(decimals(min(values), max(values), value=max(values)), 1)
+
+
+def _cell(values: Sequence[float], unit: str, places: int, *, best: bool, limit: float) -> dict[str, Any]:
     if not values:
         return cell("not measured")
     low, high = min(values), max(values)
-    places = min(decimals(low, high, value=high), 1)
     text = f"{number(high, places)}{THIN}{unit}"
     return cell(text, band(low, high, places), best=best, bad=high > limit)
 

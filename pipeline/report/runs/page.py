@@ -14,7 +14,8 @@ from pipeline.report.temperature.judgement import Judgement
 from pipeline.verdict.controllers import heading
 from pipeline.verdict.digits import MINUS, THIN, band, count, declared, quantity, short, with_unit
 from pipeline.verdict.settings import ReportRules
-from pipeline.verdict.verdict import FAILED, Figure, Question, row_places, state
+from pipeline.verdict.verdict import FAILED, Figure, Question, state
+from pipeline.verdict.wording import places_of
 
 # the stages that give the figures
 MEASURED_BY = ("evaluate_temperature", "compose_parts", "train_ilc", "evaluate_setpoint", "train_classifier")
@@ -161,19 +162,19 @@ def _row(question: Question, before: Figure | None, now: Figure | None) -> dict[
     bound = "at least" if question.at_least else "at most"
     limit = with_unit(question.limit, question.unit, declared(question.limit))
     text, moved = _change(question, before, now)
+    places = places_of(question, [figure for figure in (before, now) if figure])
     return {
         "title": question.title,
         "limit": f"{bound} {limit}" if np.isfinite(question.limit) else "none",
-        "cells": (_cell(question, before), _cell(question, now)),
+        "cells": (_cell(question, before, places), _cell(question, now, places)),
         "change": text,
         "moved": moved,
     }
 
 
-def _cell(question: Question, figure: Figure | None) -> dict[str, Any]:
+def _cell(question: Question, figure: Figure | None, places: int) -> dict[str, Any]:
     if figure is None:
         return {"text": "not measured", "band": "", "bad": False}
-    places = row_places(question, [figure])
     ends = band(figure.low, figure.high, places, beyond=question.beyond)
     return {
         "text": quantity(figure.value, question.unit, places, beyond=question.beyond),

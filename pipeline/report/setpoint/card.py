@@ -157,15 +157,16 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     if not scores.default:
         return Missing("not measured", "No controller was chosen")
     stays, names = verdict.rule.startswith("Stays"), shown(scores)
-    what, does = ("stay", "settle and stay") if stays else ("settled", "settle")
+    what = "stay" if stays else "settled"
     cases = [case for case, cell in scores.counting(scores.default) if isinstance(_of(cell, what), Figure)]
     if not cases:
         return Missing("not measured", "no case counts")
     first = min(cases, key=lambda case: _value(scores, names[0], case, what))
-    listed = ", ".join(f"{name} {_text(scores, name, first, what)}" for name in names)
+    # as the answer above it counts them
+    listed = ", ".join(f"{name} {_text(scores, name, first, 'stay')}" for name in names)
     low, high = deciding_case.MIDDLE
     return Deciding(
-        f"Runs that {does} in {within(first)}: {listed}.",
+        f"Runs that settle and stay in {within(first)}: {listed}.",
         need(deciding_case.panel(sources, scores, first, names)),
         deciding_case.key(scores, names)
         + f". Median and {high - low}{THIN}% of the runs; dashed: ±{FLOW_BAND:g}{THIN}%.",

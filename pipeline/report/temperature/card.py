@@ -90,7 +90,7 @@ def _cost(sources: Sources) -> str:
 
 def _row(question: Question, judged: Judgement, names: Sequence[str]) -> dict[str, Any]:
     figures = [judged.answers.get(name, {}).get(question.key, NOT_JUDGED) for name in names]
-    places = places_of(question, figures[:2])
+    places = places_of(question, figures)
     # doing nothing is no contestant: it never overshoots
     values = [
         figure.value

@@ -87,6 +87,7 @@ def _row(
         if isinstance(figure, Figure) and _competes(name) and math.isfinite(figure.value)
     ]
     best = (max if question.at_least else min)(values, default=math.nan)
+    places = places_of(question, figures)
     alike = len(set(values)) < 2 or question.key == "data"
     return {
         "key": question.key,
@@ -94,7 +95,14 @@ def _row(
         "word": word,
         "limit": "none" if question.key in ("crossings", "supervisor") else limit_text(question),
         "cells": [
-            _cell(sources, question, name, figure, best=not alike and getattr(figure, "value", None) == best)
+            _cell(
+                sources,
+                question,
+                name,
+                figure,
+                places,
+                best=not alike and getattr(figure, "value", None) == best,
+            )
             for name, figure in zip(names, figures, strict=True)
         ],
     }
@@ -106,7 +114,7 @@ def _competes(name: str) -> bool:
 
 
 def _cell(
-    sources: Sources, question: Question, name: str, figure: Figure | Missing, *, best: bool
+    sources: Sources, question: Question, name: str, figure: Figure | Missing, places: int, *, best: bool
 ) -> dict[str, Any]:
     if isinstance(figure, Missing):
         return {
@@ -118,7 +126,6 @@ def _cell(
         }
     own = entry(comparison(sources.metrics), "contestants", name)
     held = state(question, figure) if math.isfinite(question.limit) else ""
-    places = places_of(question, [figure])
     lost, of = unstable(own)
     text = worded(question, figure.value, places)
     if lost and (text == "unstable" or question.key in ("disk", "delay_s")):
