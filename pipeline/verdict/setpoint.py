@@ -47,7 +47,7 @@ LOOP = "setpoint"
 MODEL_BASED, DATA_DRIVEN, BASELINE = "model-based", "data-driven", "baseline"
 SIMULATORS = {
     "paper": "The paper’s simulator",
-    "recorded": "Recorded windows",
+    "recorded": "Classified windows",
     "harm": "From good starts",
     "pixels": "Through pictures",
 }

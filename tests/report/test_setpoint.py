@@ -49,7 +49,7 @@ def test_the_default_is_named_with_its_worst_case_and_the_pair_is_answered(proje
     # by hand: 100 - 1.5 (0.2 + 3 x 0.1) = 99.25
     assert "Pass (simulation): the model-based controller “Bayes filter”. All seven rules passed." in text
     assert (
-        "In its worst case (recorded windows, sticky, half clog) 99.2 % of 2,100 runs, worth 2,100 that "
+        "In its worst case (classified windows, sticky, half clog) 99.2 % of 2,100 runs, worth 2,100 that "
         f"share nothing, settle and stay. {PAIRED}" in text.replace("  ", " ")
     )
     title = re.search(r"<title>(.*?) ·", PAGE.read_text())[1]
@@ -399,7 +399,7 @@ def test_stretches_of_held_windows_end_where_the_reason_changes():
 def test_cases_are_said_in_words():
     assert (
         setpoint_verdict.case_text(("recorded", "recorded, sticky, clog"), whole=True)
-        == "Recorded windows, sticky, clog"
+        == "Classified windows, sticky, clog"
     )
     assert setpoint_verdict.case_text(("paper", "accuracy 0.7, gain 0.6")) == "accuracy 70\u202f%, gain 0.6"
 

@@ -119,7 +119,7 @@ def test_the_last_case_stands_first_where_it_decides_and_is_drawn_on_both_pages(
     one = INDEX.read_text()
     assert one.count("clog to 60") == 1
     assert re.search(
-        r"settle and stay in recorded windows, sticky, half clog: [^.]*[\d.]+\s%, Bayes filter 40\.0", one
+        r"settle and stay in classified windows, sticky, half clog: [^.]*[\d.]+\s%, Bayes filter 40\.0", one
     )
     clogs = [run for run in manifest(Path("reports").absolute())["tables"] if run["name"] == "paths"][0][
         "events"

@@ -411,7 +411,7 @@ SMALLEST = """() => [...document.querySelectorAll("main *")].filter(e => e.getCl
 
 def test_without_a_script_the_picture_of_the_deciding_case_stands(view):
     page = view(script=False, width=390)
-    svg = page.locator(".still svg.plot")
+    svg = page.locator(".still svg[role=img]")
     expect(svg).to_be_visible()
     assert "The deciding case" in svg.get_attribute("aria-label")
     # letters of the picture are 12 of its 360 units

@@ -9,7 +9,8 @@ from pipeline.report.shared import page, words
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.controllers import BY_NAME
 from pipeline.verdict.digits import number
-from pipeline.verdict.evidence import gap_of, known, need, need_figure, or_nothing
+from pipeline.verdict.evidence import entry, gap_of, known, need, need_figure, or_nothing
+from pipeline.verdict.temperature import comparison
 from pipeline.verdict.verdict import FAILED, OPEN, PASSED, Missing, Verdict
 
 WORDS = ("verdict", "margin_disk", "margin_delay", "spread", "step", "hash")
@@ -21,6 +22,7 @@ def render(sources: Sources, verdict: Verdict) -> str:
     shown = _certificate(sources, lines)
     whole = known(shown, None)
     mine = next((line for line in known(lines, []) if line.loop == "temperature"), None)
+    passes = entry(comparison(sources.metrics), "best_reason", "passes") or {}
     return page.render(
         "certificate.html",
         here="certificate",
@@ -33,6 +35,7 @@ def render(sources: Sources, verdict: Verdict) -> str:
         missing_certificate=gap_of(shown),
         controllers=sources.certified.get("temperature") or {},
         known_names=BY_NAME,
+        beyond=[name for name, held in passes.items() if not held],
         figure=_figure,
         poles=poles(shown),
         margins=margins(whole) if whole else [],

@@ -35,7 +35,7 @@ from pipeline.verdict.deposition import (
     structures,
     worst,
 )
-from pipeline.verdict.digits import THIN, band, count, decimals, number
+from pipeline.verdict.digits import THIN, band, count, decimals, number, percent
 from pipeline.verdict.evidence import Table, known, lookup, need, or_gap, or_nothing
 from pipeline.verdict.verdict import PASSED, Figure, Missing, Question, Verdict, count_of
 
@@ -171,9 +171,12 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     stretch = {key: table[key][rows] for key in table}
     drawn = [name for name in names if np.isfinite(stretch.get(f"{name}_mm3_per_s", np.nan)).any()]
     finding = f"{part.part}, material {part.material}, about the largest error:"
+    listed = ", ".join(
+        f"{NAMES[name]} leaves {percent(part.scores[name].error, 2)}" for name in drawn if name in part.scores
+    )
     return Deciding(
         finding,
-        draw_flows(stretch, drawn, finding, PICTURE),
+        draw_flows(stretch, drawn, f"{finding} {listed}", PICTURE),
         flow_key(drawn),
         page.in_viewer("signals", part=[part.part], material=[part.material], y=lines_of(drawn)),
     )

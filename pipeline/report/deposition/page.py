@@ -129,9 +129,10 @@ def _answer(structure: Structure, move: Move | None, library: str) -> dict[str, 
     scores, limit = structure.known(), structure.asked.flow_error_percent
     question = Question(0, "", structure.part, "%", limit, False, "")
     gap = Missing("not measured", "no score")
+    library_css = "dd hollow" if MARK[library] in page.HOLLOW else "dd"
     shown = [
         (NAMES[name], css, count_of(scores[name].error) if name in scores else gap)
-        for name, css in ((OURS, "mb"), (library, "dd"), ("ilc", "acc"))
+        for name, css in ((OURS, "mb"), (library, library_css), ("ilc", "acc"))
     ]
     return {"structure": structure, "move": move, "strip": charts.strip(question, shown, (9, 25, 17))}
 

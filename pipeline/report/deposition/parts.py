@@ -295,7 +295,7 @@ def _stretch(table: Table, part: str, material: str, chosen: str) -> Stretch:
 
 def flow_key(names: Sequence[str]) -> Markup:
     """Which line is whose in `draw_flows`."""
-    return page.line_key([("wanted", "ref"), *((NAMES[name].lower(), LINE[name]) for name in names)])
+    return page.line_key([("wanted", "want"), *((NAMES[name].lower(), LINE[name]) for name in names)])
 
 
 def _panel(stretch: Stretch, names: list[str]) -> Markup:
@@ -322,7 +322,7 @@ def draw_flows(
         charts.linear(float(finite.min()) - room, float(finite.max()) + room),
         *size, 40, 34, 22, 14,
     )  # fmt: skip
-    layers = [charts.line(frame, time, flows["wanted"], "ref", most=120)]
+    layers = [charts.line(frame, time, flows["wanted"], "want", most=120)]
     layers += [charts.line(frame, time, flows[name], LINE[name], most=120) for name in names]
     return charts.panel(
         frame, layers, alt=alt, css="mb lead-picture", title="flow, mm³/s", across="time, s",

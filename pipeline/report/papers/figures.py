@@ -115,7 +115,7 @@ def plot(
         above=24,
         right=panel.get("right", 12 + max(7 * len(name) for *_, name in curves)),
     )
-    layers = [charts.level(frame, value, "lim", name) for value, name in panel.get("levels", ())]
+    layers = [charts.level(frame, value, "ax", name) for value, name in panel.get("levels", ())]
     for x, y, css, _ in curves:
         layers.append(charts.stems(frame, x, y) if css == "stem" else charts.line(frame, x, y, css))
     layers += [charts.label(frame, x[-1], y[-1], name, dx=5, dy=4) for x, y, _, name in curves if name]

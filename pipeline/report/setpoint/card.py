@@ -80,7 +80,7 @@ def _figures(sources: Sources, verdict: Verdict) -> dict[str, Any]:
                 "cells": _harm_cells(harms, limit),
             },
         ],
-        "basis": f"Worst case; small: 95{THIN}% interval",
+        "basis": f"Worst case of each; small: 95{THIN}% interval",
         "cost": _cost(sources),
         "picture": deciding(sources, verdict),
         "sources": sources.source("scoreboard"),

@@ -123,7 +123,7 @@ def picture(sources: Sources, board: Board | Missing) -> Picture:
         key(board, found.runs)
         + f". One run from each of {starts}, on the first pool of segments. {reading(found.runs)} Dashed: "
         f"{BEST_FLOW - FLOW_BAND:g}–{BEST_FLOW + FLOW_BAND:g}{THIN}%. Inside: there, and "
-        f"{BEST_TEMPERATURE:g}{THIN}±{THIN}{TEMPERATURE_BAND:g}{THIN}°C; grey: "
+        f"{BEST_TEMPERATURE:g}{THIN}±{THIN}{TEMPERATURE_BAND:g}{THIN}°C; level: "
         f"{sources.declared.rules.settled_percent:g}{THIN}% of the runs are to settle. What lies beyond the "
         "axis is not drawn.",
         page.origin(sources.source("paths"), simulator=case[0], case=case[1], controller=list(found.runs)),
@@ -231,7 +231,7 @@ def _event(frame: charts.Frame, happens: Clog | None) -> list[Markup]:
     if happens is None:
         return []
     x = float(frame.px(happens.step))
-    bar = Markup('<line class="lim" x1="{0:.1f}" x2="{0:.1f}" y1="{1}" y2="{2}"/>')
+    bar = Markup('<line class="ax" x1="{0:.1f}" x2="{0:.1f}" y1="{1}" y2="{2}"/>')
     text = f"clog to {number(happens.left, 0)}{THIN}%"
     return [
         bar.format(x, frame.above, frame.height - frame.below),

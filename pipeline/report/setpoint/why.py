@@ -219,7 +219,7 @@ def _moves(mine: Table, x: charts.Axis) -> Markup:
         for t, move in zip(mine["time_s"], mine["temperature_move_degC"], strict=True)
         if move
     ]
-    layers = [charts.level(frame, 0, "lim"), charts.stems(frame, mine["time_s"], moves)]
+    layers = [charts.level(frame, 0, "ax"), charts.stems(frame, mine["time_s"], moves)]
     for t, move in warm:
         # text on the free side of its tick
         layers.append(

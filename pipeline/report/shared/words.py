@@ -328,7 +328,7 @@ FIXED = {
         "Adds up the evidence of windows until it suffices for a move, then begins anew.",
     ),
     "recorded_windows": (
-        "Recorded windows",
+        "Classified windows",
         "Windows that the trained classifier really named, drawn again by the flow of the moment: "
         "its errors sit at the class borders and persist.",
     ),

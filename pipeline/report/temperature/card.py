@@ -77,7 +77,7 @@ def beside_plain(sources: Sources, judged: Judgement) -> str:
         return ""
     less = 100 * (1 - theirs / ours)
     amount = f"{number(abs(less), 0)}{THIN}% {'less' if less > 0 else 'more'}"
-    return f"A plain PI (SIMC) costs {amount}{failure(judged, plain, ())}."
+    return f"Plain PI: {amount} cost than {heading(judged.subject)}{failure(judged, plain, ())}."
 
 
 @or_nothing
@@ -160,18 +160,26 @@ def deciding(
     seconds = until_settled(table, runs, zone)
     early = {who: rows[table["time_s"][rows] <= seconds] for who, rows in runs.items()}
     label = sources.zone([o.name for o in sources.declared.machine.outputs].index(zone))
-    off = np.abs(table[zone] - table[f"{zone}_reference"])
-    finding = f"{lead}By how much {label} is off its reference after {short(seconds, 2)} s, in °C"
-    left = {who: f"{heading(who)} {short(float(off[rows[-1]]), 2)}" for who, rows in early.items()}
     styles, limit = page.line_styles({who: who for who in runs}), sources.declared.rules.settled_error_degC
-    key = page.line_key([*((left[who], styles[who]) for who in left), (f"limit {limit:g}", "lim")])
-    alt = f"{finding}: {', '.join(left.values())}."
+    finding = f"{lead}The last second in which {label} is off its reference by more than {limit:g}{THIN}°C"
+    until = {who: f"{heading(who)} {_last_off(table, rows, zone, limit)}" for who, rows in early.items()}
+    key = page.line_key([*((until[who], styles[who]) for who in until), ("limit", "lim")])
+    alt = f"{finding}: {', '.join(until.values())}."
     return Deciding(
         f"{finding}:",
         _drawn(table, early, zone, limit, alt, size, styles),
         key,
         page.in_viewer("trajectories", case_name=["deciding"], contestant=list(runs), y=[zone]),
     )
+
+
+def _last_off(table: Table, rows: np.ndarray, zone: str, limit: float) -> str:
+    """The last time, in s, at which the zone is off its reference by more than `limit`."""
+    time, off = table["time_s"][rows], np.abs(table[zone][rows] - table[f"{zone}_reference"][rows])
+    outside = time[~(off <= limit)]
+    if len(outside) and outside[-1] == time[-1]:
+        return f"beyond {time[-1]:,.4g}"
+    return f"{outside[-1]:,.4g}" if len(outside) else "none"
 
 
 def _drawn(
