@@ -750,7 +750,7 @@ def _price(evidence: Evidence, parts: Sequence[Structure]) -> str:
             f"Before anything ran, γ of the paper’s law was {number(before['gamma'], 2)} on the nominal "
             f"plant and {number(before['gamma_worst'], 2)} on the worst of its family, "
             f"above 1 on {percent(before['gamma_above_1_percent'], 2)}: "
-            f"{'it may be run' if safe else 'do not run it'} on this machine."
+            f"{'that law may run' if safe else 'do not run that law'} on this machine."
         )
     reports = known(evidence.tables["conformance"], {})
     short = {part: report.get("shorter_than_lead", 0) for part, report in reports.items()}

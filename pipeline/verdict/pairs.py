@@ -90,12 +90,13 @@ def crossing_sentence(curve: Mapping[str, Any], step: float, here: str) -> str:
         )
     at = number(crossing["samples"] * step / 60, 0)
     ends = [crossing[end] and crossing[end] * step / 60 for end in ("low", "high")]
-    within = (
-        f"90 % interval {band(*ends, 0) or number(ends[0], 0)} min"
-        if None not in ends
-        else f"its 90 % interval does not end within {here}"
-    )
-    return f"The pair changes places at {at} min ({within}): from there on {ahead[-1]} costs less."
+    if None in ends:
+        return (
+            f"The pair changes places at {at} min on average, which is not sure: the 90 % interval does not "
+            f"end within {here}."
+        )
+    interval = f"90 % interval {band(*ends, 0) or number(ends[0], 0)} min"
+    return f"The pair changes places at {at} min ({interval}): from there on {ahead[-1]} costs less."
 
 
 def _refusal(name: str, why: str) -> str:

@@ -326,7 +326,10 @@ def test_the_length_at_which_the_pair_changes_places_is_said_and_nothing_beyond_
         "The pair changes places at 5 min (90 % interval 4–7 min): from there on subspace + LQG costs less."
     )
     curve["crossing"] |= {"low": None, "high": None}
-    assert "(its 90 % interval does not end within this record)" in curve_sentence(stages)
+    assert curve_sentence(stages) == (
+        "The pair changes places at 5 min on average, which is not sure: the 90 % interval does not end "
+        "within this record."
+    )
     curve["controllers"]["learned_kernel"]["cost"] = [2.9, 2.8, 2.2]
     curve["crossing"]["samples"] = None
     assert curve_sentence(stages) == (
