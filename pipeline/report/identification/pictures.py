@@ -93,10 +93,10 @@ def _stretch(sources: Sources, table: Table, name: str, small: str, points: int)
         else charts.linear(0, 1)
     )
     x = charts.linear(0, float(time[-1]) or 1.0, ticks=6)
-    above = charts.Frame(x, y, width=568, height=150, left=40, below=4)
+    above = charts.Frame(x, y, width=568, height=160, left=40, below=4, above=24)
     error = [measured - simulated, measured - ahead]
     reach = 1.05 * float(np.nanmax(np.abs(error[0]), initial=0.0)) or 1.0
-    below = charts.Frame(x, charts.balanced(reach), width=568, height=96, left=40)
+    below = charts.Frame(x, charts.balanced(reach), width=568, height=130, left=40)
     ends = np.flatnonzero(np.diff(table["segment"])) + 1
     masked = charts.stretches(~np.isfinite(measured))
 

@@ -209,7 +209,7 @@ def _panel(name: str, before: Curve | None, now: Curve | None) -> dict[str, Any]
     """This run's curve is solid, the accepted run's grey and dashed."""
     drawn = [(curve, css) for curve, css in ((before, "line thin dash"), (now, "line")) if curve]
     x, y = (np.concatenate([curve[end] for curve, _ in drawn]) for end in (2, 3))
-    frame = charts.Frame(charts.linear(float(x.min()), float(x.max())), _scale(y), 340, 140, 44, 30)
+    frame = charts.Frame(charts.linear(float(x.min()), float(x.max())), _scale(y), 340, 140, 44, 30, 22)
     across, up = drawn[-1][0][:2]
     ends = [f"{'accepted run' if 'dash' in css else 'this run'} {curve.y[-1]:g}" for curve, css in drawn]
     return {

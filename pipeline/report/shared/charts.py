@@ -159,6 +159,9 @@ class Frame(NamedTuple):
         return self.height - self.below - self.y.at(values) * (self.height - self.below - self.above)
 
 
+PHONE = 345  # px of a phone's screen that a picture has: where it is drawn wider, its letters grow
+
+
 def panel(
     frame: Frame,
     layers: Sequence[Markup],
@@ -201,15 +204,16 @@ def panel(
     )
     head = Markup('<text class="yt" x="0" y="9">{}</text>').format(title) if title else Markup("")
     if across:
-        head += Markup('<text class="yt" x="{}" y="{}" text-anchor="end">{}</text>').format(
+        head += Markup('<text class="yt across" x="{}" y="{}" text-anchor="end">{}</text>').format(
             frame.width - frame.right, frame.height - 2, across
         )
     return Markup(
-        '<svg class="plot {}" style="--w:{}px" viewBox="0 0 {} {}" role="img" aria-label="{}"{}>'
-        '<g class="axes">{}</g>{}{}</svg>'
+        '<svg class="plot {}" style="--w:{}px;--k:{:.3f}" viewBox="0 0 {} {}" role="img" '
+        'aria-label="{}"{}><g class="axes">{}</g>{}{}</svg>'
     ).format(
         css,
         frame.width,
+        max(frame.width / PHONE, 1),
         frame.width,
         frame.height,
         alt,

@@ -136,7 +136,7 @@ def glyph(state: str) -> Markup:
 def widest(columns: Sequence[PictureColumn]) -> int:
     """Width in px for which the widest chart of these columns was drawn."""
     panels = "".join(str(panel) for column in columns for panel in column.panels)
-    return max(map(int, re.findall(r'style="--w:(\d+)px"', panels)), default=208)
+    return max(map(int, re.findall(r'style="--w:(\d+)px', panels)), default=208)
 
 
 def mark(controller: str) -> Markup:

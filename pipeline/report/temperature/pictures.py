@@ -118,7 +118,7 @@ def _boxes(cases: pd.DataFrame, names: list[str]) -> Markup:
         charts.Axis(-0.5, len(names) - 0.5, ()),
         width=560,
         height=34 * len(names) + 40,
-        left=130,
+        left=165,
         above=10,
         below=22,
         right=14,
