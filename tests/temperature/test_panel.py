@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from pipeline.papers.published import GAMMA, REFERENCE, TAU
-from pipeline.temperature.controllers.law import ActuatorLimits, constant, deployed, ramp, sinusoid
+from pipeline.temperature.controllers.law import (
+    ActuatorLimits,
+    constant,
+    deployed,
+    feasible_target,
+    ramp,
+    sinusoid,
+)
 from pipeline.temperature.plant import baam, padded, plant, simulate
 from pipeline.temperature.test_set import panel
 from pipeline.temperature.test_set.panel import Cases, Figures, PlantSpread, Questions, Rollout
@@ -153,6 +160,26 @@ def test_a_plant_is_given_the_lag_that_it_does_not_hold():
     assert abs((one > 0).mean() - 0.9) < 0.05
     np.testing.assert_allclose(two[one > 3.1], one[one > 3.1] - 2, rtol=1e-9)
     assert not two[one < 3].any() and not none.any()
+
+
+def test_a_plant_that_nobody_can_hold_is_drawn_nearer_and_the_others_stay():
+    """A mode of a million samples whose state lies far from zero: with a little more loss it heats by itself,
+    and inputs from 0 to 100 cannot take that away."""
+    machine = plant([[1 - 1e-6]], [[0.5]], [[1.0]])._replace(b=np.array([-0.151]), d=np.array([1e5]))
+    spread, limits = PlantSpread(0.15, 0.1, 1e-4, 0.0, 8.0), (np.zeros(1), np.full(1, 100.0))
+
+    def holdable(one) -> bool:
+        target = feasible_target(one, np.array([150.0]), *limits)
+        return bool(np.abs(target.miss).max() <= 0.1)
+
+    far, near = (
+        panel.drawn([machine], 20, spread, cells=False, rng=np.random.default_rng(3), holdable=asked)
+        for asked in (lambda _: True, holdable)
+    )
+    held = [holdable(one) for one in far]
+    assert not all(held) and all(map(holdable, near))
+    for one, other, stays in zip(far, near, held, strict=True):
+        assert np.array_equal(one.A, other.A) == stays and np.array_equal(one.b, other.b) == stays
 
 
 def test_a_lag_is_drawn_apart_from_what_else_a_plant_differs_by():

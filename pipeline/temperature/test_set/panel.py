@@ -198,27 +198,39 @@ def _of_heat(eigenvalue: complex) -> bool:
 
 
 def drawn(
-    nominal: Sequence[Plant], count: int, spread: PlantSpread, *, cells: bool, rng: np.random.Generator
+    nominal: Sequence[Plant],
+    count: int,
+    spread: PlantSpread,
+    *,
+    cells: bool,
+    rng: np.random.Generator,
+    holdable: Callable[[Plant], bool] = lambda _: True,
 ) -> list[Plant]:
-    """`count` plants around the nominal ones in turn."""
+    """`count` plants around the nominal ones in turn. One that is not `holdable` lies half as far from its
+    nominal one, and half as far again: what nobody can hold compares no controllers."""
     plants, lags = [], rng.spawn(1)[0].uniform(0, spread.lag, count)
     for k in range(count):
         plant = nominal[k % len(nominal)]
         gains = 1 + spread.input_gain * rng.uniform(-1, 1, plant.m)
         slower, loss, ambient, late = rng.uniform(-1, 1), rng.uniform(), rng.uniform(-1, 1), rng.uniform()
-        plants.append(
-            varied(
+        for near in NEARER:
+            found = varied(
                 plant,
-                gains=gains,
-                slower=spread.slower * slower,
-                loss=spread.extra_heat_loss * loss,
-                ambient=spread.ambient_degC * ambient,
+                gains=1 + near * (gains - 1) if near < 1 else gains,
+                slower=near * spread.slower * slower,
+                loss=near * spread.extra_heat_loss * loss,
+                ambient=near * spread.ambient_degC * ambient,
                 late=late < spread.delayed,
                 cells=cells,
-                lag=lags[k],
+                lag=near * lags[k],
             )
-        )
+            if holdable(found):
+                break
+        plants.append(found)
     return plants
+
+
+NEARER = (1.0, 0.5, 0.25, 0.125, 0.0)  # shares of the spread that are tried
 
 
 def corners(nominal: Sequence[Plant], spread: PlantSpread) -> tuple[list[Plant], Strength]:
@@ -833,7 +845,7 @@ def from_declaration(settings: Panel, machine: Machine, truth: Plant, family: Se
     """The study's machine: judged around the truth, tuned around the identified family, so that no controller
     may lean on what one identification got wrong."""
     reference = np.array([o.reference for o in machine.outputs])
-    noise = np.full(len(reference), settings.noise_degC)
+    noise, limits = np.full(len(reference), settings.noise_degC), input_limits(machine)
     judging, training = (
         _half(
             settings,
@@ -844,10 +856,10 @@ def from_declaration(settings: Panel, machine: Machine, truth: Plant, family: Se
             cells=cells,
             steps=settings.steps,
             declared=spread_of(settings),
+            held=None if cells else limits,
         )
         for half, around, cells in ((settings.judging, [truth], True), (settings.training, family, False))
     )
-    limits = input_limits(machine)
     missed = unreachable(truth, (limits.low, limits.high), reference, *output_limits(machine))
     cold = settings.judging.starts_degC[0] * np.ones_like(reference)
     return Rehearsal(
@@ -890,14 +902,20 @@ def _half(
     declared: PlantSpread,
     limits: ActuatorLimits | None = None,
     told: Told | None = None,
+    held: ActuatorLimits | None = None,
 ) -> Cases:
     """One half of the panel: cases of `steps` at most, on plants that lie around those of `around` as
-    `declared` says; starts are held within `limits`."""
+    `declared` says; starts are held within `limits`, and every constant reference can be within `held`."""
     rng = np.random.default_rng(half.seed)
     scaled = PlantSpread(*(half.spread * value for value in declared))._replace(
         delayed=min(half.spread * declared.delayed, 1.0)
     )
-    plants = drawn(padded(around), half.plants, scaled, cells=cells, rng=rng)
+
+    def holdable(plant: Plant) -> bool:
+        at = [feasible_target(plant, r, held.low, held.high) for r in questions.constants] if held else []
+        return all(np.abs(target.miss).max() <= REACHED_DEGC for target in at)
+
+    plants = drawn(padded(around), half.plants, scaled, cells=cells, rng=rng, holdable=holdable)
     return asked(
         plants,
         questions,
