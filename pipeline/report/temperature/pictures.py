@@ -49,7 +49,7 @@ def plants(sources: Sources) -> Picture:
     a, b = pair_names(sources.metrics)
     by_plant = cases.groupby(["plant", "contestant"])["cost"].mean().unstack("contestant")
     shown = []
-    finding = "The pair did not run the same plants."
+    finding, left = "The pair did not run the same plants.", ""
     if {a, b} <= set(by_plant):
         both = by_plant[[a, b]].dropna()
         cheaper = int((both[a] < both[b]).sum())
@@ -57,6 +57,8 @@ def plants(sources: Sources) -> Picture:
             f"{heading(a)[:1].upper()}{heading(a)[1:]} costs less than {in_a_sentence(b)} on {cheaper} of "
             f"{count(len(both), 'plant')}."
         )
+        if cheaper < len(both):
+            left = f"Left, blue and dashed: {in_a_sentence(b)} costs less. "
         shown.append(
             PictureColumn(
                 "The pair", "mean cost on each plant, a line a plant", "", [_slopes(both, a, b, finding)]
@@ -71,10 +73,8 @@ def plants(sources: Sources) -> Picture:
     return Picture(
         finding,
         shown,
-        f"Cost as deployed, log scale. Left: ink where model-based costs less, blue and dashed where "
-        "data-driven does. Right: bar "
-        f"from the 5{THIN}% to the 95{THIN}% quantile, box the middle half, line the median, dot the "
-        f"90{THIN}% quantile.",
+        f"Cost as deployed, log scale. {left}Right: bar from the 5{THIN}% to the 95{THIN}% quantile, box the "
+        f"middle half, line the median, dot the 90{THIN}% quantile.",
         page.origin(sources.source("cases")),
     )
 
