@@ -183,7 +183,11 @@ def test_a_contestant_that_fails_a_rule_which_the_card_does_not_show_says_so_und
 
 def lines_listed(told):
     """{controller: value} below the deciding picture, whose caption begins what is told."""
-    return dict(re.findall(r" ([A-Za-z+, ]+?) ((?:beyond )?\d[\d.]*|none) ?,", told[: told.index("limit")]))
+    return dict(
+        re.findall(
+            r" ([A-Za-z+, ]+?) ((?:beyond )?\d[\d.]*|none)(?:\u202f| )?s? ?,", told[: told.index("limit")]
+        )
+    )
 
 
 CAPTION = "is off its reference by more than"

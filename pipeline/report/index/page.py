@@ -15,7 +15,7 @@ from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import card as temperature_card
 from pipeline.report.temperature.judgement import Judgement
 from pipeline.report.temperature.page import drift_state
-from pipeline.verdict.evidence import need, or_no_entries
+from pipeline.verdict.evidence import entry, need, or_no_entries
 from pipeline.verdict.verdict import FAILED, PASSED, Verdict
 
 
@@ -35,6 +35,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         cards=cards(sources, judged, verdicts),
         change=told,
         accepted_on=accepted_on(sources),
+        accepted_at=entry(sources.accepted, "accepted", "commit"),
         machine=judged.changed.machine if judged.changed else {},
         files=files(sources, judged.verdict),
         words=words.chosen(sources, words.INDEX),

@@ -76,8 +76,8 @@ def beside_plain(sources: Sources, judged: Judgement) -> str:
     if judged.subject == plain or not ours < math.inf > theirs:
         return ""
     less = 100 * (1 - theirs / ours)
-    amount = f"{number(abs(less), 0)}{THIN}% {'less' if less > 0 else 'more'}"
-    return f"Plain PI: {amount} cost than {heading(judged.subject)}{failure(judged, plain, ())}."
+    amount = f"{number(abs(less), 0)}{THIN}% {'cheaper' if less > 0 else 'dearer'}"
+    return f"{heading(plain)}: {amount} than {heading(judged.subject)}{failure(judged, plain, ())}."
 
 
 @or_nothing
@@ -178,8 +178,8 @@ def _last_off(table: Table, rows: np.ndarray, zone: str, limit: float) -> str:
     time, off = table["time_s"][rows], np.abs(table[zone][rows] - table[f"{zone}_reference"][rows])
     outside = time[~(off <= limit)]
     if len(outside) and outside[-1] == time[-1]:
-        return f"beyond {time[-1]:,.4g}"
-    return f"{outside[-1]:,.4g}" if len(outside) else "none"
+        return f"beyond {time[-1]:,.4g}{THIN}s"
+    return f"{outside[-1]:,.4g}{THIN}s" if len(outside) else "none"
 
 
 def _drawn(
