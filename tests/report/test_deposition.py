@@ -76,7 +76,7 @@ def test_the_composer_with_the_least_worst_error_is_named_with_its_figure_yardst
     assert "commands up to 20 times the steady one." in text
     assert (
         "γ of the paper’s law was 0.76 on the nominal plant and 1.20 on the worst of its family, "
-        "above 1 on 70 %: do not run it" in text
+        "above 1 on 70 %: do not run that law" in text
     )
     assert (
         re.search(r"<title>(.*?) ·", PAGE.read_text())[1]

@@ -33,7 +33,7 @@ def step(sentence: str, command: str) -> dict[str, str]:
 
 
 # width and height of a card's picture, px
-PICTURE = (332, 124)
+PICTURE = (332, 118)
 
 
 class Deciding(NamedTuple):
