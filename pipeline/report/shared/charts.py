@@ -159,7 +159,7 @@ class Frame(NamedTuple):
         return self.height - self.below - self.y.at(values) * (self.height - self.below - self.above)
 
 
-PHONE = 345  # px of a phone's screen that a picture has: where it is drawn wider, its letters grow
+PHONE = 340  # px of a phone's screen that a picture has: where it is drawn wider, its letters grow
 
 
 def panel(
@@ -207,13 +207,14 @@ def panel(
         head += Markup('<text class="yt across" x="{}" y="{}" text-anchor="end">{}</text>').format(
             frame.width - frame.right, frame.height - 2, across
         )
+    grown = frame.width / PHONE
     return Markup(
         '<svg class="plot {}" style="--w:{}px;--k:{:.3f}" viewBox="0 0 {} {}" role="img" '
         'aria-label="{}"{}><g class="axes">{}</g>{}{}</svg>'
     ).format(
-        css,
+        f"{css} grows" if grown > 1 else css,
         frame.width,
-        max(frame.width / PHONE, 1),
+        grown,
         frame.width,
         frame.height,
         alt,
