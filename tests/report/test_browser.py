@@ -61,6 +61,16 @@ def test_no_letter_of_a_chart_is_smaller_than_11_px_on_a_phone(shown):
     assert [text for size, text in found if size < 10.99] == []
 
 
+@pytest.mark.parametrize("shown", NARROW, indirect=True, ids=str)
+def test_no_picture_scrolls_sideways_on_a_phone_but_in_the_second_level_of_detail(shown):
+    wide = shown.evaluate(
+        """() => [...document.querySelectorAll("main figure")]
+        .filter(figure => !figure.closest("details") && figure.scrollWidth > figure.clientWidth + 1).length"""
+    )
+    assert wide == 0
+    assert shown.evaluate("document.documentElement.scrollWidth") <= 390
+
+
 @pytest.mark.parametrize(
     ("shown", "unscripted"), list(zip(WIDE, PAGES, strict=False)), indirect=True, ids=PAGES
 )

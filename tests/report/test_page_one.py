@@ -181,6 +181,16 @@ def test_a_contestant_that_fails_a_rule_which_the_card_does_not_show_says_so_und
     assert told == {"low": "; fails disk margin", "bad": "", "good": "", "none": ""}
 
 
+def test_a_plain_pi_stands_beside_the_one_that_runs_with_its_cost(reports, cards):
+    kept = reports.parent / "datasets/evaluate_temperature/figures.json"
+    figures = json.loads(kept.read_text())["contestants"]
+    told = re.search(r"PI, SIMC: (\d+)\W*% (cheaper|dearer) than subspace \+ LQG", cards["temperature"])
+    assert told, cards["temperature"]
+    plain, ours = (figures[name]["cost"]["median"] for name in ("pi_simc", "subspace_lqg"))
+    less = 100 * (1 - plain / ours)
+    assert int(told[1]) == round(abs(less)) and told[2] == ("cheaper" if less > 0 else "dearer")
+
+
 def lines_listed(told):
     """{controller: value} below the deciding picture, whose caption begins what is told."""
     return dict(
