@@ -99,7 +99,8 @@ def mean_log_costs(cases: Mapping[str, np.ndarray]) -> dict[str, float]:
 
 
 def answers(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """How often each contestant was the best and won the pair, by how much, and the CPU time of all."""
+    """How often each contestant was the best and won the pair, by how much, what each cost on each record
+    (nothing where it was refused), and the CPU time of all."""
 
     def counted(values: list) -> dict[str, int]:
         return {str(value): values.count(value) for value in dict.fromkeys(values)}
@@ -109,6 +110,10 @@ def answers(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "best": counted([run["best"] for run in runs]),
         "pair_winner": counted([run["pair"]["winner"] for run in runs]),
         "pair_difference_percent": [run["pair"]["difference"] for run in runs],
+        "costs": {
+            name: [round(float(np.exp(run["costs"][name])), 6) for run in runs if name in run["costs"]]
+            for name in dict.fromkeys(name for run in runs for name in run["costs"])
+        },
         "cpu_s": round(sum(run["cpu_s"] for run in runs)),
     }
 
