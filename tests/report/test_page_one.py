@@ -79,7 +79,7 @@ def test_deposition_shows_the_worst_stream_of_each_composer_and_the_range(report
         errors = scores.rms_percent_of_on_off[scores.composer == composer]
         asked += [errors.max()] + ([errors.min(), errors.max()] if np.ptp(errors) else [])
     np.testing.assert_allclose(shown, asked, atol=0.51)
-    lines = numbers(row(cards["deposition"], "Line volume", "Above learning"))
+    lines = numbers(row(cards["deposition"], "Line volume", "Above learned part"))
     worst = scores.worst_line_volume_percent[scores.composer == "basis"].max()
     assert lines[0] == 3.0 and any(line == pytest.approx(worst, abs=0.051) for line in lines[2:3])
 

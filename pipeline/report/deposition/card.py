@@ -65,7 +65,7 @@ def _figures(sources: Sources, verdict: Verdict) -> dict[str, Any]:
         "rows": [
             _row("Flow error", streams, names, Structure.error, asked.flow_error_percent, "≤", "%"),
             _row("Line volume", streams, names, Structure.worst_line, asked.line_volume_percent, "±", "%"),
-            _row("Above learning it", streams, names, _above, asked.above_whole_points, "≤", "pts"),
+            _row("Above learned part", streams, names, _above, asked.above_whole_points, "≤", "pts"),
         ],
         "basis": f"Worst of {count(len(streams), 'stream')}; small: range",
         "cost": _cost(sources),

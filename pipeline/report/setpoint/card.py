@@ -68,7 +68,8 @@ def _figures(sources: Sources, verdict: Verdict) -> dict[str, Any]:
     names, asked = shown(scores), sources.declared.rules
     limits = bars(sources.evidence, scores)
     harms = [harm_of(scores, name, limits) for name in names]
-    limit = next((harm.limit for harm in harms if isinstance(harm, Harm)), None)
+    # one limit a case
+    allowed = sorted({harm.limit for harm in harms if isinstance(harm, Harm)})
     return {
         "entrants": [entrant(role(scores, name), name, scores.kinds[name]) for name in names],
         "rows": [
@@ -76,8 +77,8 @@ def _figures(sources: Sources, verdict: Verdict) -> dict[str, Any]:
             _shares("Stays", scores, names, "stay", asked.stay_percent),
             {
                 "title": "Good prints moved",
-                "limit": "" if limit is None else f"≤ {limit:g}{THIN}%",
-                "cells": _harm_cells(harms, limit),
+                "limit": f"≤ {' or '.join(f'{limit:g}' for limit in allowed)}{THIN}%" if allowed else "",
+                "cells": _harm_cells(harms),
             },
         ],
         "basis": f"Worst case of each; small: 95{THIN}% interval",
@@ -120,18 +121,13 @@ def _share(figure: Figure | Missing, best: float | None, *, bad: bool) -> dict[s
     return cell(share_text(share), band(share.low, share.high, 1), best=share.value == best, bad=bad)
 
 
-def _harm_cells(harms: Sequence[Harm | Missing], limit: float | None) -> list[dict[str, Any]]:
-    """The harm of each in the case that decides for it; where another limit holds in that case, with it."""
+def _harm_cells(harms: Sequence[Harm | Missing]) -> list[dict[str, Any]]:
+    """The harm of each in the case that decides for it."""
     best = best_of([h.figure.value if isinstance(h, Harm) else None for h in harms], at_least=False)
-    cells = []
-    for harm in harms:
-        if not isinstance(harm, Harm):
-            cells.append(cell(harm.state))
-            continue
-        share = _share(harm.figure, best, bad=harm.state == FAILED)
-        own = "" if harm.limit == limit else f"; ≤ {harm.limit:g}{THIN}%"
-        cells.append(share | {"band": share["band"] + own})
-    return cells
+    return [
+        _share(harm.figure, best, bad=harm.state == FAILED) if isinstance(harm, Harm) else cell(harm.state)
+        for harm in harms
+    ]
 
 
 def _step(verdict: Verdict) -> dict[str, str]:

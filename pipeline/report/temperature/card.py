@@ -76,8 +76,9 @@ def beside_plain(sources: Sources, judged: Judgement) -> str:
     if judged.subject == plain or not ours < math.inf > theirs:
         return ""
     less = 100 * (1 - theirs / ours)
-    amount = f"{number(abs(less), 0)}{THIN}% {'cheaper' if less > 0 else 'dearer'}"
-    return f"{heading(plain)}: {amount} than {heading(judged.subject)}{failure(judged, plain, ())}."
+    share = number(abs(less), 0)
+    amount = f"{share}{THIN}% {'cheaper' if less > 0 else 'dearer'} than" if share != "0" else "as cheap as"
+    return f"{heading(plain)}: {amount} {heading(judged.subject)}{failure(judged, plain, ())}."
 
 
 @or_nothing

@@ -84,7 +84,7 @@ def _costs(values: np.ndarray) -> charts.Axis:
     low, high = float(values.min()) / 1.05, float(values.max()) * 1.05
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     steps = (1, 2, 5) if last - first <= 3 else (1,)
-    steps = (1, 1.5, 2, 3, 4, 5, 7) if high < 10 * low else steps
+    steps = (1, 1.5, 2, 3, 5, 7) if high < 10 * low else steps
     every = [k * 10.0**decade for decade in range(first, last + 1) for k in steps]
     ticks = tuple((value, f"{value:g}") for value in every if low <= value <= high)
     return charts.Axis(low, high, ticks, log=True)
