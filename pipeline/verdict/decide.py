@@ -396,8 +396,8 @@ def _closest_limit(standing: Standing) -> str:
     places = places_of(question, [figure])
     whose = " of the weakest tenth of plants" if question.key in MARGINS else ""
     return (
-        f"Closest to its limit: {question.rule}{whose}, {worded(question, figure.value, places)} of "
-        f"at {'least' if question.at_least else 'most'} {with_unit(question.limit, question.unit, places)}."
+        f"Closest to its limit: {question.rule}{whose}, {worded(question, figure.value, places)} "
+        f"(at {'least' if question.at_least else 'most'} {with_unit(question.limit, question.unit, places)})."
     )
 
 
@@ -411,7 +411,7 @@ def _worst_margins(compared: Mapping[str, Any], winner: Standing) -> str:
         worst = finite(entry(compared, "contestants", winner.name, "margins", question.key, "worst"))
         if worst < question.limit:
             least = with_unit(question.limit, question.unit, 2)
-            parts.append(f"{question.rule} {with_unit(worst, question.unit, 2)} of {least}")
+            parts.append(f"{question.rule} {with_unit(worst, question.unit, 2)} (limit {least})")
     return f"Below the limit on the worst plant: {', '.join(parts)}." if parts else ""
 
 

@@ -268,7 +268,7 @@ def pair_sentence(evidence: Evidence) -> PairSentence:
     spent = evidence.tables.get("prints")
     turns = "" if not isinstance(spent, Mapping) else _turns(pd.DataFrame(spent), better, worse)
     loser = phrase(worse).split(" by ")[0]
-    short = f"{head} {phrase(better)}, {number(ratio, 2)} of the error of {loser} ({band(*ends, 2)})."
+    short = f"{head} {phrase(better)}, {number(ratio, 2)} times the flow error of {loser} ({band(*ends, 2)})."
     return PairSentence(f"{head} {text}.", better, short, turns)
 
 

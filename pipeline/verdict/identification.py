@@ -65,7 +65,7 @@ def trust(evidence: Evidence) -> Verdict:
             ((fit.name, need(fit.simulated)) for fit in fits(evidence)), key=lambda pair: pair[1].value
         )
         lead = f"All {count(len(rules), 'rule')} passed;"
-        reason = f"weakest in simulation: {weakest}, {percent_of(least)} of at least {least_fit():g}{THIN}%."
+        reason = f"weakest in simulation: {weakest}, {percent_of(least)} (at least {least_fit():g}{THIN}%)."
         remedy = "Valid for the range of inputs and temperatures that the record covers."
     else:
         word = "failed" if first.state == FAILED else "undecided"

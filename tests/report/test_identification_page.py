@@ -46,7 +46,7 @@ def test_a_model_that_passes_every_rule_is_trusted_for_every_use_with_its_weakes
     white()
     text = page()
     assert "Trust this model to design controllers, to predict 10 s ahead and to simulate." in text
-    assert "All seven rules passed; weakest in simulation: zone_2, 80 % of at least 50 %." in text
+    assert "All seven rules passed; weakest in simulation: zone_2, 80 % (at least 50 %)." in text
     assert 'class="verdict passed"' in IDENTIFICATION.read_text()
 
 

@@ -163,7 +163,7 @@ def test_passed_says_what_is_closest_to_its_limit_and_never_counts_drift_as_pass
     assert verdict.lead == "Every rule measured so far passed on 6 simulated plants."
     assert (
         verdict.reason
-        == "Closest to its limit: disk margin of the weakest tenth of plants, 0.70 of at least 0.40."
+        == "Closest to its limit: disk margin of the weakest tenth of plants, 0.70 (at least 0.40)."
     )
     assert verdict.remedy.startswith("Drift is not measured. The nightly job measures it and has not run.")
     calm = judge(metrics(), drift=Figure(1.0, 0.0, 2.0))
@@ -188,7 +188,7 @@ def test_a_pass_on_nine_plants_in_ten_names_the_margins_that_the_worst_plant_lac
     verdict = judge(stages)
     assert verdict.state == PASSED
     assert verdict.reason.replace("\u202f", " ").endswith(
-        "Below the limit on the worst plant: disk margin 0.18 of 0.40, delay margin 0.41 s of 1.00 s."
+        "Below the limit on the worst plant: disk margin 0.18 (limit 0.40), delay margin 0.41 s (limit 1.00 s)."
     )
 
 
