@@ -354,7 +354,8 @@ def share_in(row: Mapping[str, Any] | None) -> Figure | None:
 
 @instead(lambda gap: _seen(gap))
 def _right_by_flow(evidence: Evidence, column: int) -> Reading:
-    """Windows named rightly were every flow from 70 to 150 % as frequent; yardsticks are not judged so."""
+    """The share of windows classified correctly if every flow from 70 to 150 % were as frequent. Yardsticks
+    are not judged by it."""
     if column:
         return _seen(
             Missing("not applicable", "the yardsticks are judged on windows of all flows"), "not judged so"

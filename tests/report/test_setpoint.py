@@ -111,7 +111,7 @@ def test_whoever_is_the_default_is_called_by_its_kind(project, name, called):
         ("ece_window", 0.05, "calibrated, a window",
         "Stated and true shares of right answers differ by 0.050 on average; 0.04 is allowed."),
         ("intervals_percent__image", [70.0, 72.0], "right, an image",
-        "The classifier names 79.7 % of frames of segments it never saw rightly; 78 % are asked for."),
+        "The classifier is right on 79.7 % of the frames of new segments; 78 % are asked for."),
     ],
 )  # fmt: skip
 def test_the_first_failed_rule_is_said_in_words(project, metric, value, rule, sentence):

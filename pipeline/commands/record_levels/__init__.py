@@ -137,7 +137,7 @@ def write(
     right, count = sum(one.named * one.windows for one in told), sum(one.windows for one in told)
     return (
         f"{place}: {count} windows at {len(told)} levels; corrected flow to "
-        f"{100 * recorded.levels.spread:.0f} % (one deviation), classes named rightly in "
+        f"{100 * recorded.levels.spread:.0f} % (one deviation), classes right in "
         f"{100 * right / count:.0f} % of these windows\n"
         f"the borders of good, {thin:g} and {thick:g} %, are where this camera shows {low:.0f} and "
         f"{high:.0f} %\n"
