@@ -1,11 +1,14 @@
 """Prediction-error refinement of an identified plant: Gauss-Newton on one-step or simulation errors over
 whole records (Ljung, System Identification, ch. 7 and 10).
 
-Both criteria are one output-error problem  x(t+1) = F x + G v,  ŷ = C x + H v:
-  prediction  v = [u; 1; y],  F = A - K C,  G = [B - K D, b - K d, K],  H = [D, d, 0]
-  simulation  v = [u; 1],     F = A,        G = [B, b],                 H = [D, d]
-so one routine serves both. It needs no filter per parameter: in block-modal coordinates every sensitivity is
-a first-order filter of one signal.
+Both criteria are the same output-error problem:
+
+    x(t+1) = F x + G v,  ŷ = C x + H v
+    prediction  v = [u; 1; y],  F = A - K C,  G = [B - K D, b - K d, K],  H = [D, d, 0]
+    simulation  v = [u; 1],     F = A,        G = [B, b],                 H = [D, d]
+
+So one routine serves both. It needs no filter per parameter, because in block-modal coordinates every
+sensitivity is a first-order filter of one signal.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""The search for the parameters of one controller: every controller has the same search, budget and cost, on
+"""The search for the parameters of one controller. Every controller has the same search, budget and cost, on
 the same training half of the panel, as it would be deployed."""
 
 from collections.abc import Sequence
@@ -25,8 +25,8 @@ POLISHED = 1 / 3
 def search(
     name: str, settings: TuneWeights, problem: DesignProblem, setting: CaseConditions
 ) -> tuple[str, tuning.SearchResult | str]:
-    """The name and the best parameters of a controller; a sentence if it cannot be designed, an empty one if
-    the record does not allow it."""
+    """Returns the name of a controller and the result of its search. Instead of a result, returns a sentence
+    if it cannot be designed or every candidate fails, and an empty one if the record does not allow it."""
     controller = table.BY_NAME[name]
     low, start, high = table.bounds(controller, problem)
     # a kernel may have no minimum at the start, and one where inputs cost more
@@ -69,9 +69,9 @@ def search(
 
 
 def _cost(design: Design, rests: Sequence[Rest], settings: TuneWeights, setting: CaseConditions) -> float:
-    """The declared cost of a candidate. Raises ValueError if its margins on the plant that a tenth of the
-    training plants lie below are less than the least: figures in simulation are no reason to give robustness
-    away."""
+    """Returns the declared cost of a candidate. Raises ValueError if one of its margins, at the 10 % quantile
+    over the training plants, is below the least allowed. Better figures in simulation do not justify less
+    robustness."""
     training = setting.rehearsal.training
     margins = scorecard.margins(training.plants, design.law, grid=80)
     disk, delay_s = (
@@ -90,7 +90,8 @@ def _cost(design: Design, rests: Sequence[Rest], settings: TuneWeights, setting:
 
 
 def tuned_values(name: str, result: tuning.SearchResult, problem: DesignProblem) -> dict[str, Any]:
-    """The parameters by name, the weights that they stand for, the cost, and which of them lie at a bound."""
+    """Returns the parameters by name, the weights that follow from them, the cost, and which parameters lie
+    at a bound."""
     controller = table.BY_NAME[name]
     low, _, high = table.bounds(controller, problem)
     share = np.log(result.theta / low) / np.log(high / low)
