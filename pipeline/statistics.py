@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.special
 
-# up to so many blocks all 2^n signs are tried
+# the largest number of blocks for which all 2^n signs are tried
 EXACT = 14
 
 
@@ -108,7 +108,7 @@ def wilson_interval(p: float, n: float) -> Share:
     z = float(scipy.special.ndtri(0.975))
     centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
-    # of none or all one end is the share itself, which rounding would miss
+    # if p is 0 or 1, one end is p itself, which rounding would miss
     low, high = min(float(max(centre - half, 0.0)), p), max(float(min(centre + half, 1.0)), p)
     return Share(100.0 * p, 100.0 * low, 100.0 * high)
 

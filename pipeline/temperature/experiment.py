@@ -44,11 +44,11 @@ from pipeline.temperature.identification.validation import horizon, step_respons
 from pipeline.temperature.plant import Plant, padded, strictly_proper
 from pipeline.temperature.tracking import Law, aimed, gains
 
-TAIL = 3000  # samples at the end of the record that the present state is taken from
-LATEST = 20  # samples at its very end by which each member is set right
-STORED = 6e6  # numbers of a family's responses that are held at once; beyond, every k-th sample is looked at
+TAIL = 3000  # samples at the end of the record from which the present state is estimated
+LATEST = 20  # samples at its very end from which the bias of each member is computed
+STORED = 6e6  # numbers of a family's responses kept at once; beyond it only every k-th sample is kept
 SURE = 0.99  # share of the record's simulation errors that the band holds
-SIGMAS = 3.0  # of the sensor's noise
+SIGMAS = 3.0  # standard deviations of the sensor's noise
 
 
 class Wish(NamedTuple):
@@ -92,7 +92,7 @@ class Answers(NamedTuple):
 
 
 class Extremes(NamedTuple):
-    """Highest and lowest (p,) of every output over a family, in °C."""
+    """Highest and lowest values (p,) of every output over a family, in °C."""
 
     highest: np.ndarray
     lowest: np.ndarray
@@ -143,7 +143,7 @@ def band(model: Plant, u: Segments, y: Segments) -> Band:
     errors = np.vstack([b - simulated(model, a, b) for a, b in zip(us, ys, strict=True)])
     with np.errstate(over="ignore", invalid="ignore"):
         ahead = np.nanstd(np.vstack(one_step_errors(model, us, ys)), axis=0)
-    # a predictor that runs away says nothing of the noise: what simulation misses is then its upper end
+    # an unstable predictor does not show the noise; the simulation error is then its upper limit
     noise = np.fmin(ahead, np.nanstd(errors, axis=0))
     return Band(noise, np.nanquantile(np.abs(errors), SURE, axis=0))
 
@@ -294,7 +294,7 @@ def _run(
         y = np.einsum("kpn,kn->kp", C, x) + np.einsum("kpm,km->kp", D, u) + d
         y += disturbance[t][:, None]
         highest, lowest = np.maximum(highest, y.max(axis=0)), np.minimum(lowest, y.min(axis=0))
-        if not np.abs(y).max() < 1e6:  # a loop that runs away has left every limit
+        if not np.abs(y).max() < 1e6:  # an unstable loop has left every limit
             break
         if stop is not None and ((highest > stop.highest) | (lowest < stop.lowest)).any():
             break
@@ -303,7 +303,7 @@ def _run(
         applied = np.clip(wanted, low, high)
         limited += (applied != wanted).mean(axis=1)
         z = z @ law.A.T + applied @ law.B_u.T + measured @ law.B_y.T + r @ law.B_r.T + law.c
-        # an integrator that would push a cut command further rests (conditional integration)
+        # an integrator that would push a limited command further rests (conditional integration)
         moved = law.integral * (r - measured)
         further = ((-moved @ law.K_r.T) * (wanted - applied)).max(axis=1) > 0
         xi = xi + np.where(further[:, None], 0.0, moved)
@@ -323,7 +323,7 @@ def _at_rest(
         balance = balance + 1e-9 * np.eye(plant.n)
     gain = plant.C @ np.linalg.solve(balance, plant.B) + plant.D
     offset = plant.C @ np.linalg.solve(balance, plant.b) + plant.d
-    # the law at rest on its reference asks for u = held - K_r xi
+    # at rest at its reference the law commands u = held - K_r xi
     held = -law.k - law.D @ r - law.K_r @ r
     z = np.zeros(len(law.A))
     if len(law.A):
@@ -335,12 +335,12 @@ def _at_rest(
 
 
 ENOUGH = 0.5  # of the largest safe amplitude: the rest is given up to come nearer to the references
-SEEN = 0.05  # of an output's largest effect: pairs below it teach and are asked nothing
+SEEN = 0.05  # of an output's largest effect: pairs below it are ignored
 HOLD = 0.5  # of the fastest time constant: the shortest hold of a binary sequence
 CORNERS = 3.0  # times the corner frequency: the highest line of a multisine
-LINES = 12  # of each input in a multisine at least: fewer are told by their own past
-SWITCHES = 20  # at least so many holds in an experiment, so that inputs move independently
-DRAWS = 30  # phases drawn for a multisine, of which the flattest is taken
+LINES = 12  # least number for each input in a multisine: fewer can be predicted from their own past
+SWITCHES = 20  # least number of holds in an experiment, so that inputs move independently
+DRAWS = 30  # random sets of phases tried for a multisine; the flattest is taken
 USEFUL = 0.3  # largest expected standard error of an input's strongest gain; beyond it nothing is learned
 STEPS = 6  # halvings of each search for an amplitude
 FAIR = 0.4  # of the wanted amplitudes: a shorter experiment is tried below it
@@ -468,7 +468,7 @@ def pace(plants: Sequence[Plant], reach: np.ndarray, longest: int) -> Pace:
 def signal(rng: np.random.Generator, samples: int, asked: Wish, speed: Pace) -> np.ndarray:
     """Returns a signal (samples, m) of amplitude 1 and about zero mean, with its power at the frequencies to
     which the outputs respond."""
-    # the fastest time constant that each input shows; the fastest of all where it shows none
+    # the fastest time constant of each input's clear effects; the fastest of all if it has none
     tau = np.where(speed.seen, speed.time_constant, np.inf).min(axis=0)
     tau = np.where(np.isfinite(tau), tau, speed.fastest)
     if asked.signal == "prbs":
@@ -551,13 +551,13 @@ def programme(
     at_u = reach.free[:, instants].reshape(-1) + from_step.sum(axis=1)
     swing = (1 + g) * np.repeat(reach.peak[:, None], len(instants), axis=1).reshape(-1, m) @ cap
     moved = ambient(family, reach.at[instants])[:, None] + family.band.width
-    # the ramp answers as if the centre had come from zero; what the last inputs leave beside it dies away
+    # `rise` assumes a ramp from zero; what the last inputs add to that decays
     beside = np.abs(from_step - rise * begin.u).sum(axis=1)
     slack = np.tile(moved[None], (len(reach.free), 1, 1)).reshape(-1) + g * beside
     count = len(at_u)
     high, low = (np.tile(side, count // p) for side in (family.y_high, family.y_low))
     none = np.zeros((count, p))
-    # y = at_u + rise (centre - u), and the doubt about it
+    # y = at_u + rise (centre - u), and its uncertainty
     upper = np.hstack([rise, g * np.abs(rise), none, swing[:, None]])
     lower = np.hstack([-rise, g * np.abs(rise), none, swing[:, None]])
     rows = [upper, lower]
@@ -605,7 +605,7 @@ def safe_amplitude(family: Family, reach: Answers, centre: np.ndarray, cap: np.n
     room = np.minimum(cap, np.maximum(np.minimum(family.high - centre, centre - family.low), 0.0))
 
     def largest(amplitude, toward):
-        """How far from `amplitude` toward `toward` is safe, between 0 and 1."""
+        """Returns the safe share, 0 to 1, of the way from `amplitude` to `toward`."""
         safe, beyond = 0.0, 1.0
         if within(open_loop(family, reach, centre, toward), family):
             return 1.0
@@ -751,7 +751,7 @@ def _designed(family: Family, reach: Answers, shapes: tuple[np.ndarray, np.ndarr
         extremes = forecast(family, u)
         if within(extremes, family):
             break
-        amplitude = 0.9 * amplitude  # between the samples that the search looked at it was hotter
+        amplitude = 0.9 * amplitude  # between the samples of the search it was hotter
     else:
         return _left(family, reach, centre)
     taught = lesson(u[rise:], family.pace, family.band.noise)

@@ -1,5 +1,5 @@
-"""The plant of loop 1: a state-space model of heaters and motor -> barrel temperatures, the constants of the
-BAAM study, simulation and plant spread."""
+"""The plant of loop 1: a state-space model from heaters and motor to barrel temperatures, with the constants
+of the BAAM study, simulation, rank tests and steady states."""
 
 from collections.abc import Sequence
 
@@ -68,7 +68,7 @@ def simulate(plant: Plant, u: np.ndarray, x0: np.ndarray) -> tuple[np.ndarray, n
 
 def markov_parameters(plant: Plant, lags: int) -> np.ndarray:
     """h (lags, p, m) with h[k-1] = C A^(k-1) B, the response of y at lag k to a unit pulse of u."""
-    # columns A^k B in blocks that double: two products where there were `lags`
+    # columns A^k B in blocks that double: two products per doubling instead of one per lag
     columns, power = plant.B, plant.A
     while columns.shape[1] < lags * plant.m:
         columns, power = np.hstack([columns, power @ columns]), power @ power
@@ -92,7 +92,7 @@ def clip_spectral_radius(A: np.ndarray, radius: float) -> np.ndarray:
         shrunk = radius * (1 - 1e-9) / np.maximum(np.abs(diagonal), 1e-300)
         np.fill_diagonal(upper, diagonal * np.minimum(shrunk, 1.0))
         A_clipped = np.real(Z @ upper @ Z.conj().T)
-    # a defective A has no modal basis to draw in
+    # a defective A has no exact modal basis, so a pole may still lie outside
     return A_clipped * min(1.0, radius * (1 - 1e-9) / np.abs(np.linalg.eigvals(A_clipped)).max())
 
 

@@ -89,7 +89,7 @@ def trajectories(inputs: Sequence[PlantSignal], outputs: Sequence[PlantSignal]) 
     return Schema("trajectories", 3, tuple(columns))
 
 
-# every case that every contestant ran, as deployed, on true outputs
+# every case of every controller, as deployed, on true outputs
 CASES = Schema(
     "cases",
     1,

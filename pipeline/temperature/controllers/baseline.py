@@ -17,14 +17,13 @@ import scipy.optimize
 from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
 from pipeline.temperature.tracking import Law
 
-RISEN = 0.8  # of the largest excursion: up to there a response is fitted; later a slow tail would be tau
-LEVEL = 0.9  # of the band over a family that may not hold zero where a sign is certain
+RISEN = 0.8  # of the largest excursion: a response is fitted up to there; beyond, a slow tail would set tau
+LEVEL = 0.9  # level of the band over a family: a sign is certain if the band excludes zero
 WEAKEST = 1e-9  # of the strongest effect: below it an input does not move an output
-NOISE_SHARE = (
-    0.03  # of an input's range: 3 percent of duty a standard deviation wears no relay and heats nothing
-)
-MOST_POINTS = 150  # of a response in one fit
-LONGEST_TAU = 5.0  # times the stretch that is fitted: beyond it a straight line stands for every tau
+# of an input's range: a standard deviation of 3 percent of duty neither wears a relay nor adds heat
+NOISE_SHARE = 0.03
+MOST_POINTS = 150  # largest number of points of a response in one fit
+LONGEST_TAU = 5.0  # times the fitted stretch: for any longer tau a straight line is used
 
 
 class Pairing(NamedTuple):
@@ -89,7 +88,7 @@ def pairing(
     stretch = _stretch(plant, horizon)[0]
     responses, *others = (_responses(member, stretch) for member in (plant, *family))
     inputs = _assigned(np.abs(slope) * (high - low), _certain(responses, fitted, others))
-    # the gain in percent per °C at which noise moves the input by its share: the inverse may be zero
+    # inverse of the gain in percent per °C at which noise moves the input by its share; it may be zero
     noise = np.zeros(plant.p) if noise_degC is None else noise_degC
     per_gain = noise / (NOISE_SHARE * (high - low)[inputs])
     return _settings(
@@ -104,8 +103,8 @@ def rises(plant: Plant, horizon: int) -> list[list[Rise]]:
     responses = _responses(plant, stretch)
     direction = _direction(responses, decayed)
     if decayed and stretch > horizon:
-        # beyond `horizon` an identified slow mode may turn an answer round: where it turns that of an
-        # output's strongest input, responses are followed as of an integrator
+        # beyond `horizon` an identified slow mode may reverse a response: if it reverses that of an
+        # output's strongest input, responses are followed as for an integrator
         early = _responses(plant, _tenth(horizon))
         strongest = np.abs(early[-1]).argmax(axis=1)
         first, outputs = _direction(early, False), np.arange(plant.p)
@@ -205,7 +204,7 @@ def _assigned(effect: np.ndarray, certain: np.ndarray) -> np.ndarray:
     an output has no certain input left."""
     moves = effect > WEAKEST * effect.max()
     allowed = moves & certain
-    # one that is not allowed costs more than all that are could save
+    # a forbidden pair costs more than all allowed pairs together could save
     cost = -np.log(np.where(allowed, effect, 1.0))
     worst = (np.ptp(cost[allowed]) + 1.0) * len(effect) if allowed.any() else 1.0
     inputs = scipy.optimize.linear_sum_assignment(np.where(allowed, cost, cost.max() + worst))[1]

@@ -20,9 +20,9 @@ from pipeline.temperature.controllers import window
 from pipeline.temperature.controllers.law import FADES, FeedForward
 from pipeline.temperature.plant import Plant, plant, simulate
 
-LONGEST, ENOUGH = 24, 20  # samples of the window, and for each of its columns
-BLOCKS = 8  # left out one by one: how sure a gain is
-DETERMINED = 2.0  # deviations from zero of a gain that is fed forward
+LONGEST, ENOUGH = 24, 20  # longest window in samples, and samples required for each of its columns
+BLOCKS = 8  # of the record, left out one by one to find the deviation of a gain
+DETERMINED = 2.0  # deviations: a smaller gain is not fed forward
 AHEAD, LONGEST_LEAD = 60, 10.0  # samples
 OWN = 0.005  # share of a disturbance's variance that inputs and other disturbances do not explain
 
@@ -68,11 +68,11 @@ def learn(acting: Sequence[np.ndarray], y: Sequence[np.ndarray], inputs: int) ->
     gains = np.array([_forward(one, inputs) for one in left if one is not None])
     gain, deviation = np.zeros((inputs, q)), np.full((inputs, q), np.nan)
     gain[:, tells] = _forward(model, inputs)
-    # jackknife over blocks; a block without which there is no stable model leaves everything open
+    # jackknife over blocks; if the model without one block is unstable, the deviation is unknown (NaN)
     if len(gains) == BLOCKS:
         deviation[:, tells] = np.sqrt((BLOCKS - 1) * gains.var(axis=0))
     d, lead = whole[:, inputs:], np.zeros(q)
-    # the middle of the models that each lack a block: one of the whole record may be chance
+    # the median of the models without one block, because that of the whole record may be chance
     lead[tells] = np.median([_lead(one, inputs) for one in left if one is not None] or [[0.0]], axis=0)
     return Told(effect, d.mean(axis=0), np.quantile(d, 0.95, axis=0), gain, deviation, lead)
 

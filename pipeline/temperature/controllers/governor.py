@@ -36,15 +36,15 @@ class OutputLimits(NamedTuple):
     overshoot: float
 
 
-# steps ahead at most
+# largest number of steps ahead
 LONGEST = 120
-# shares of its peak from which on a pulse response is looked at, and up to which closely
+# shares of a pulse response's peak: examined from REACHED on, in small steps up to SHOULDER
 REACHED, SHOULDER = 0.2, 0.9
-# share of what the innovations told that is forgotten a step, and of the drift, and with them the observer's
-# constants: for a furthest look ahead of so many steps; a machine that needs more is watched as much longer
+# shares that are forgotten per step, of the sums over innovations and of the drift. These and the observer's
+# constants hold for a furthest look ahead of UNHURRIED steps; they are scaled for a machine that needs more
 FORGETS, LEAK, UNHURRIED = 0.005, 1e-4, 16
-# overshoots that an output which has arrived may go beyond its target, if the whole range of the inputs for
-# one sample moves it by fewer overshoots than BARELY
+# an output that has arrived may be LET_GO overshoots beyond its target, if the whole range of the inputs for
+# one sample moves it by fewer than BARELY overshoots
 LET_GO, BARELY = 4.0, 20.0
 
 

@@ -27,7 +27,7 @@ def svec(S: np.ndarray) -> np.ndarray:
 
 
 def smat(h: np.ndarray, d: int) -> np.ndarray:
-    """The symmetric (d, d) matrix whose half-vector is h."""
+    """Returns the symmetric (d, d) matrix with half-vector h."""
     i, j = np.triu_indices(d)
     S = np.empty((d, d))
     S[i, j] = S[j, i] = h / np.where(i == j, 1.0, ROOT2)
@@ -35,7 +35,7 @@ def smat(h: np.ndarray, d: int) -> np.ndarray:
 
 
 def skron(X: np.ndarray) -> np.ndarray:
-    """The matrix with svec((X z)(X z)') = skron(X) svec(z z'), for X (a, d): shape (a (a+1)/2, d (d+1)/2)."""
+    """Returns skron(X) (a (a+1)/2, d (d+1)/2) with svec((X z)(X z)') = skron(X) svec(z z'), for X (a, d)."""
     (p, q), (k, j) = np.triu_indices(X.shape[0]), np.triu_indices(X.shape[1])
     product = X[p][:, k] * X[q][:, j]
     off = k != j
@@ -156,8 +156,8 @@ class Regression(NamedTuple):
     condition: float
 
     def stored(self) -> dict[str, tuple[np.ndarray, str, str]]:
-        """The regression as named arrays with unit and meaning, for an
-        artifact; `restored` reads them back."""
+        """Returns the regression as named arrays with unit and meaning, for an artifact; `restored` reads
+        them back."""
         return {name: (np.asarray(getattr(self, name), float), *_STORED[name]) for name in self._fields}
 
 
@@ -232,8 +232,8 @@ def regress(data: Tuples, *, mu: float = 0.0, tolerance: float = 1e-9, limit: fl
     inside, outside = np.flatnonzero(of_v), np.flatnonzero(~of_v)
     wanted = np.vstack([skron(of_j[:q]), skron(of_j[q:]), skron(action)])
     normal = gram[np.ix_(inside, inside)]
-    # what is linear in v regresses on itself; left to solve for is the
-    # share of the innovation, and what the ridge holds back
+    # the part that is linear in v regresses on itself, so only the shares of the innovation and of the ridge
+    # must be solved for
     rest = gram[np.ix_(inside, outside)] @ wanted[:, outside].T
     if mu:
         ridge = _ridge(mu, W, u_scale, row[inside], column[inside])
@@ -387,7 +387,7 @@ def value_iteration(
     h_0 = data.G_e @ svec(Q) + data.G_u @ svec(R)
     row, column = np.triu_indices(q)
     weight = np.where(row == column, 1.0, ROOT2)
-    # svec and smat once for all iterations: which entry of h each entry of H is, and its weight
+    # svec and smat once for all iterations: the index in h of each entry of H, and its weight
     row_v, column_v = np.triu_indices(q + m)
     weight_v = np.where(row_v == column_v, 1.0, ROOT2)
     place, unweighted = smat(np.arange(len(h_0), dtype=float), q + m), smat(np.ones(len(h_0)), q + m)

@@ -124,7 +124,7 @@ def feasible_target(
     widest = 0.49 * (high - low).min()
     while step > 1e-3:
         wider = _steady(plant, r, low, high, slack + step)
-        # a target that the middle of the limits reaches as well has all the slack there is
+        # `widest` is the largest possible slack: u near the middle of its limits
         if slack + step <= widest and np.linalg.norm(wider.miss) <= reach:
             nearest, slack = wider, slack + step
         else:
@@ -151,9 +151,9 @@ def state_at_rest(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
     return np.linalg.solve(balance, plant.B), np.linalg.solve(balance, plant.b)
 
 
-# °C by which a percent of an input counts beside what outputs miss: of equally good inputs, the smaller
+# °C of miss that one percent of an input counts as: among equally good inputs the smaller wins
 LIGHT = 1e-6
-# shares below which a gradient, of what its terms come to, and a fall of the cost may be rounding
+# relative sizes below which a gradient (of the sum of its terms), and a fall of the cost, may be rounding
 ROUNDING, FALL = 1e-13, 1e-15
 
 
@@ -296,15 +296,16 @@ class Governor(NamedTuple):
     overshoot: float
 
 
-# projections over all outputs, and over both sides: inputs mostly move one output each, so that a few suffice
+# repeats over all outputs, and over both sides: inputs mostly move one output each, so a few suffice
 SWEEPS, ROUNDS = 8, 2
-# percent by which rows are equal, or missed: one case by itself takes the same steps as among many
+# percent: smaller differences and violations of rows are ignored, so that a case takes the same steps alone
+# as among many
 EXACT = 1e-9
-# squares of innovations beyond those of the best member from which a member does not count
+# a member does not count if its squares of innovations are this many times those of the best member
 CONTRADICTED = 4.0
-# overshoots from its target within which an output has arrived
+# an output has arrived if it is within this many overshoots of its target
 ARRIVED = 2.0
-# an input that moves an output by less than this share of the strongest one is not held back for it
+# an input that moves an output by less than this share of the strongest one is not changed for it
 LEAST_EFFECT = 0.05
 
 
@@ -387,7 +388,7 @@ def governed(
         part.reshape(*part.shape[:2], y_star.shape[1], -1)
         for part in (ahead[:, :, :rows], ahead[:, :, rows:])
     )
-    # where an output is, is measured: how strong the inputs are is in doubt for what is still to come
+    # the present output is measured; the strength of the inputs is uncertain only for the future
     free, lacks = free - (middle * lacks[..., 0])[..., None], lacks - lacks[..., :1]
     now = free[..., 0] + family.offset[:, None]
     floor, cap = _walls(family, now, y_star)
@@ -399,7 +400,7 @@ def governed(
     above = _Side(bare, strongest - less * least, family.rise, counts, cap)
     u, raised = _projected(below, -u, -high)
     u, lowered = _projected(above, -u, low)
-    # where an input is lowered for one output and was raised for another, others may do what it did
+    # if inputs are raised for one output and lowered for another, other inputs may replace them
     both = np.intersect1d(raised, lowered, assume_unique=True)
     if both.size:
         below, above, one = below.of(both), above.of(both), u[both]
@@ -464,7 +465,7 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray) -> np.ndarray:
     f, s, p, h = side.bare.shape
     m = u.shape[1]
     rows = side.rows.reshape(f, m, p, h)
-    # what hardly moves an output is not shut for its sake
+    # an input that hardly moves an output is not changed for it
     helps = np.where(rows > LEAST_EFFECT * np.maximum(rows, 0.0).max(axis=1, keepdims=True), rows, 0.0)
     helps = np.maximum(helps, 0.0)
     least = np.matmul(low, helps.reshape(f, m, -1)) + np.matmul(u, (rows - helps).reshape(f, m, -1))
@@ -483,7 +484,7 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray) -> np.ndarray:
             worst = (excess >= most[:, None] - EXACT).argmax(axis=1)
             direction = helps[j, worst] * (u > low + EXACT)
             size = (direction**2).sum(axis=1)
-            # an output that is at fault in another case alone waits for the next sweep, as it does by itself
+            # an output violated only in another case waits for the next sweep, as it would alone
             step = np.where(at_fault[:, j] & (most > EXACT), most, 0.0) / np.where(size > 0, size, np.inf)
             u = np.maximum(u - step[:, None] * direction, low)
     return u
@@ -643,7 +644,7 @@ def _leaking(balance: np.ndarray) -> np.ndarray:
 # ---- the law, a sample at a time
 
 
-AS_WISHED = 1e-9  # of an input's range, within which a command is the one that was wished
+AS_WISHED = 1e-9  # of an input's range: a command this near to the wished one counts as equal
 
 
 class FeedForward(NamedTuple):
@@ -660,7 +661,7 @@ class FeedForward(NamedTuple):
     lead: np.ndarray
 
 
-FADES = 0.5  # of a kick a sample later
+FADES = 0.5  # share of a kick that is left one sample later
 
 
 class Deployed(NamedTuple):
@@ -857,7 +858,7 @@ def _integrated(controller: Deployed, xi, error, u, wished):
     law, most = controller.law, controller.integral_limit
     if law.conditional:
         after = xi + law.integral * error
-        # the command as wished, but for rounding: a replay sums in another order than what it replays
+        # equal to the wished command except for rounding, because a replay sums in another order
         inside = np.abs(u - wished) <= AS_WISHED * (controller.limits.high - controller.limits.low)
         within = (
             np.clip(-after @ law.K_r.T, controller.limits.low, controller.limits.high) @ controller.back.T
@@ -934,7 +935,7 @@ class RunningController:
         self._w, self._t = np.zeros(0), 0
         self.forward = np.zeros(len(controller.law.D))
         q = 0 if controller.forward is None else len(controller.forward.mean)
-        # disturbances as told now and a sample ago, and the kick of a sample ago
+        # disturbances now and one sample ago, and the kick one sample ago
         self._told, self._before, self._kick = np.full(q, np.nan), np.full(q, np.nan), np.zeros(q)
 
     def tell(self, disturbances: np.ndarray) -> None:

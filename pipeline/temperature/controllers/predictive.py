@@ -31,9 +31,9 @@ import scipy.linalg
 from pipeline.temperature.controllers.kernel import window_law
 from pipeline.temperature.tracking import Law
 
-TINY = 1e-12  # a signal that stands still is refused by what it lacks, not divided by 0
-ROWS = 2  # stretches of the record for each unknown of an output, at least
-SHORTEST = 5  # samples of a horizon
+TINY = 1e-12  # avoids a division by 0 for a constant signal, which is refused later for its lack of movement
+ROWS = 2  # least number of stretches of the record for each unknown of an output
+SHORTEST = 5  # samples: the shortest horizon
 
 
 class Trajectories(NamedTuple):
@@ -122,7 +122,7 @@ def learn(
     of_column = np.concatenate(
         [np.tile(names, count) for count in (N, T) for names in (np.arange(m), np.arange(m, m + p))]
     )
-    # z is counted from the mean, so that its constant stands apart
+    # z is counted from its mean, which separates the constant
     mean = np.where(np.arange(len(of_column)) < k - 1, np.nanmean(signals, axis=0)[of_column], 0.0)
     scale = np.maximum(np.nanstd(signals, axis=0), TINY)[of_column]
     triangle, samples = _triangle(hankel_rows(u, y, N, T), mean, scale)

@@ -20,7 +20,7 @@ import numpy as np
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.tracking import Law
 
-# Klipper reads a heater's thermistor so often (klippy/extras/adc_temperature.py, REPORT_TIME)
+# interval at which Klipper reads a heater's thermistor (klippy/extras/adc_temperature.py, REPORT_TIME)
 KLIPPER_S = 0.3
 
 

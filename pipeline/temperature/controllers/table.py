@@ -83,7 +83,7 @@ CONTROLLERS = (
         in_file("designs", "hold"),
         "baseline",
     ),
-    # only where a recording is a Klipper log
+    # only if a recording is a Klipper log
     TemperatureController(
         "printer_pid",
         "Printer",

@@ -7,8 +7,8 @@ import scipy.stats
 
 from pipeline.temperature.identification.subspace import Segments, complete_runs, lagged, one_step
 
-LEVEL_CLOSED = 0.001  # of the test for feedback: far below 5 %, as records are less ideal than the test
-# rows that the test looks at, in stretches of so many: a row takes past (m + p) numbers
+LEVEL_CLOSED = 0.001  # of the test for feedback: far below 5 %, because records are not as ideal as the test
+# rows that the test uses at most, and rows of a stretch: a row takes past (m + p) numbers
 MOST, STRETCH = 40_000, 4_000
 
 
@@ -57,7 +57,7 @@ def _answers(
     at lags 1..k (N, k p), of a predictor that knows u(t); and at lag 0 (N, p), of one that does not. Returns
     None if no stretch is long enough."""
     m, runs = u[0].shape[1], [w for w in complete_runs(u, y) if len(w) > past + lags + 1]
-    # the predictor that is told u(t) has m unknowns more
+    # the predictor that knows u(t) has m unknowns more
     if sum(len(w) - past for w in runs) < (past + 1) * sum(part[0].shape[1] for part in (u, y)) + m + 1:
         return None
     data, untold = (lagged(u, y, past, feedthrough=told, offset=offset) for told in (True, False))
@@ -68,7 +68,7 @@ def _answers(
         now_u, now_y = w[past:, :m] - data.means[0, :m], w[past:, m:] - data.means[0, m:]
         told = now_y - np.hstack([now_u, z]) @ of_told
         parts[0].append(w[past + lags :, :m])
-        # as recorded: an input that is held has moved by nothing, to the last bit
+        # as recorded, so that the change of a constant input is exactly zero
         late = [w[past + lags - lag : len(w) - lag, :m] for lag in range(1, min(past, 20) + 1)]
         parts[1].append(np.stack(late, axis=1))
         parts[2].append(np.hstack([told[lags - k : len(told) - k] for k in range(1, lags + 1)]))

@@ -33,8 +33,8 @@ from pipeline.temperature.identification.refinement import FitSettings, simulate
 from pipeline.temperature.identification.subspace import Segments, lagged, realise, subspace
 from pipeline.temperature.plant import Plant
 
-SLOWER = (1, 4, 16)  # time constants of a drift that are tried, in windows
-# a mode so near an integrator moves the level itself: beside it a drift is not observable
+SLOWER = (1, 4, 16)  # tried time constants of a drift, in windows
+# a mode this near to an integrator moves the level itself, so a drift beside it is not observable
 INTEGRATES = 1e-4
 
 
@@ -73,7 +73,7 @@ def chosen_rate(
             return 0.0
         try:
             data = lagged(train_u, train_y, structure.past, feedthrough=direct, offset=structure.offset)
-        except ValueError:  # what is left of the record is too short
+        except ValueError:  # the rest of the record is too short
             return 0.0
         start = realise(data, subspace(data, structure.past)[0][:order], 1.0, structure.feedthrough)
         plant = fit(kind, start, train_u, train_y, settings, gain=False)

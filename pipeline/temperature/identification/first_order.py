@@ -85,7 +85,7 @@ def response(u: np.ndarray, time_constant_s: float, delay_s: float, sample_time_
     return scipy.signal.lfilter([0.0, 1.0 - c, c - a], [1.0, -a], late)
 
 
-# the constants that are tried, as shares of the sample time and of the record
+# number of time constants tried, from one sample time to twice the longest segment
 _GRID = 40
 MOST_SAMPLES = 3000
 

@@ -100,7 +100,7 @@ class Identified(NamedTuple):
     notes: list[str]
     feedback: ClosedLoop | None = None
     drift: float = 0.0
-    reasons: tuple[str, ...] = ()  # of the choice, among the notes
+    reasons: tuple[str, ...] = ()  # notes on the choice; they are among `notes` too
 
 
 class Settings(NamedTuple):
@@ -275,7 +275,7 @@ def _chosen(
     closed = feedback is not None and feedback.closed
     direct = [(bool(settings.feedthrough),) * len(none)]
     if settings.feedthrough is None:
-        # under feedback, u(t) holds what noise did to y(t): a row of D would be the controller's inverse
+        # under feedback, u(t) contains the noise of y(t), so a row of D would be the controller's inverse
         shows = none if closed else feedthrough_shows(u, y, pasts[0], settings.offset)
         direct = [none, shows] if any(shows) else [none]
     structure = ModelStructure(pasts[0], direct[-1], settings.offset, (0,) * u[0].shape[1])
@@ -284,7 +284,7 @@ def _chosen(
     )
     validated, notes = settings.refinement == "validated", []
     validation = Validation(settings.blocks, recordings, closed)
-    # a rank beyond max_order is a nonlinearity without noise: the order is then a choice, as with noise
+    # a rank beyond max_order shows a nonlinearity without noise; the order is then chosen as with noise
     if exact and (rank := _exact_rank(u, y, structure)) <= settings.max_order:
         notes.append(
             f"the record is noise-free: {pasts[0]} past samples predict it to rounding, "
@@ -330,7 +330,7 @@ def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
     if past:
         return (past,), False
     longest = longest_window(u, y)
-    # a few lags tell whether the record is noise-free
+    # a few lags may already show that the record is noise-free
     pasts, exact = windows(lagged(u, y, min(longest, 6), offset=offset))
     if not exact:
         pasts, exact = windows(lagged(u, y, longest, offset=offset))
@@ -356,7 +356,7 @@ def _best_candidate(
                 u, y, orders, delayed, ("subspace",), singular_values=values, validation=validation
             )
     if not table and validation.recordings:
-        # what is left without one recording is too short: blocks of every recording instead
+        # the record without one recording is too short, so blocks of every recording are used instead
         return _best_candidate(u, y, structures, settings, validation._replace(recordings=()))
     if not table:
         raise ValueError(
@@ -366,14 +366,14 @@ def _best_candidate(
         )
     if settings.refinement != "validated":
         return simplest(table), table
-    # a fit to simulated outputs takes what feedback put into u for an effect of u
+    # a fit to simulated outputs would mistake feedback in u for an effect of u
     kinds: tuple[Fit, ...] = ("prediction",) if validation.closed else ("prediction", "simulation")
     entrants = []
     for start in _shortlist(u, table):
         values = singular_values[start.structure.past, start.structure.feedthrough]
         refined: list[OrderCandidate] = []
         for kind in kinds:
-            # on a long record the fit that may only win by a fifth is tried where the other gains nothing
+            # on a long record the second fit, which must win by a fifth, is tried if the first is no gain
             if refined and _work(u, start) > WORK / 20 and _better_fit(start, refined) is not start:
                 break
             refined += cross_validate(
@@ -453,7 +453,7 @@ def _candidates(
 
 
 def _fit_all(u: Segments, y: Segments, choice: ModelChoice, sample_time_s: float) -> Identified:
-    """One fit of the chosen model on all of the record."""
+    """Fits the chosen model once to all of the record."""
     structure, order, kind, exact, table = choice
     past, settings = structure.past, FitSettings(structure.feedthrough, structure.offset, max_iterations=30)
     us, ys = shifted(u, y, structure.delays)

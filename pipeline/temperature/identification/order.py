@@ -34,23 +34,23 @@ from pipeline.temperature.plant import Plant, clip_spectral_radius, markov_param
 from pipeline.temperature.plant import plant as make_plant
 
 Fit = Literal["subspace", "prediction", "simulation"]
-NOISE_FREE = 1e-10  # share of the outputs' power that a noise-free record's one-step errors stay under
+NOISE_FREE = 1e-10  # share of the outputs' power: a record with smaller one-step errors is noise-free
 WIDEST = 360  # columns of the lagged record: the cost of a fit grows with their square
-# a refined fit must take this share off the error: its own cost of computing and of fitting noise
+# a refined fit must lower the error by this share, to be worth its computing time and its fit to noise
 WORTH_REFINING = 0.05
-CHANCE = 0.1  # that blocks show a gain where there is none
-# a simulation fit must take this share off a prediction fit's error: it leaves no model of the noise, and a
-# tracker needs one
+CHANCE = 0.1  # probability that blocks show a gain although there is none
+# a simulation fit must be better than a prediction fit by this share of the error, because it has no model of
+# the noise, which a tracker needs
 WORTH_THE_NOISE = 0.2
-# a state that takes less than this share off the error is not worth carrying in a controller
+# a state that lowers the error by less than this share is not worth carrying in a controller
 WORTH_A_STATE = 0.02
-# a refined fit costs some samples x (states + inputs)^2 an iteration: as many candidates are refined as this
-# allows, at least the best one
+# a refined fit costs about samples x (states (states + inputs))^2 an iteration: as many candidates are
+# refined as this allows, but at least the best one
 WORK = 3e8
-# of Gauss-Newton for a candidate without one block: from a consistent start the first few take nearly all
+# Gauss-Newton steps for a candidate without one block: from a consistent start the first few gain nearly all
 VALIDATED_STEPS = 4
 SMALLEST = 1e-9  # share of an output's variation below which an error is rounding
-# of the plants of a spread, which are simulated for ever: no record shows a time constant of 10^6 samples
+# pole radius of plants of a spread, which run for any time: no record shows a time constant of 10^6 samples
 LARGEST_RADIUS = 1.0 - 1e-6
 
 
@@ -134,7 +134,7 @@ def feedthrough_shows(u: Segments, y: Segments, past: int, offset: bool) -> tupl
     """Returns for each output (p,) whether Schwarz's criterion of its one-step predictor falls when u(t) is
     added to it. It also falls if a controller responds to y(t) at once, so the blocks decide."""
     q, rows = u[0].shape[1] + y[0].shape[1], sum(max(len(w) - past, 0) for w in complete_runs(u, y))
-    if rows < (past + 2) * q + 1:  # u(t) is one block of unknowns more than the window was chosen for
+    if rows < (past + 2) * q + 1:  # u(t) adds a block of unknowns to those of the window
         return (False,) * y[0].shape[1]
     power = []
     for feedthrough in (False, True):
@@ -350,7 +350,7 @@ def fit(
         )
     refined = _refined(kind, start, u, y, settings, radius)
     drawn = stabilised(refined, LARGEST_RADIUS)
-    # nearly equal poles may not be drawn back to rounding: such a plant stays as it is
+    # nearly equal poles may not move back exactly; such a plant is kept as it is
     if drawn.A is not refined.A and np.abs(np.linalg.eigvals(drawn.A)).max() <= LARGEST_RADIUS:
         refined = _refined(kind, drawn, u, y, settings, LARGEST_RADIUS)
     return kalman_gain(refined, u, y) if gain and kind == "simulation" else refined
@@ -409,15 +409,15 @@ def cross_validate(
                 plant = fit(kind, start, train_u, train_y, settings, gain=False)
                 shares = simulation_errors(plant, test_u, test_y)
                 if validation.closed:
-                    # under feedback a simulation is right in part because u holds the noise of y; one step
-                    # ahead it is not, but slow modes gain little there
+                    # under feedback a simulation is partly right only because u contains the noise of y. A
+                    # one-step prediction is not, but slow modes gain little there
                     shares = np.sqrt(shares * prediction_errors(plant, test_u, test_y))
                 whole, about_mean = shares.mean(axis=(1, 2))
                 errors.setdefault((order, kind), []).append(
                     (max((whole + about_mean) / 2, SMALLEST), max(about_mean, SMALLEST))
                 )
     m, p = u[0].shape[1], y[0].shape[1]
-    # a dead time must be worth a state
+    # a dead time counts as much as a state, so it must be worth one
     more = m * sum(structure.feedthrough) + p * structure.offset + (m + p) * sum(map(bool, structure.delays))
     return [
         OrderCandidate(

@@ -238,7 +238,7 @@ def _stepped(model: Predictor, step: np.ndarray, free: np.ndarray) -> Predictor:
 def _cost(model: Predictor, v_all, y_all) -> float:
     with np.errstate(
         over="ignore", invalid="ignore"
-    ):  # a trial step may explode; its cost is then infinite and the step refused
+    ):  # a trial step may diverge; its cost is then infinite and the step is rejected
         cost = sum(
             np.nansum((y - respond(model, v, x0)[1]) ** 2)
             for v, y, x0 in zip(v_all, y_all, model.x0, strict=True)

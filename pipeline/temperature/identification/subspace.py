@@ -14,7 +14,7 @@ import scipy.linalg
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.plant import plant as make_plant
 
-ROUNDING = 1e-13  # relative ridge on second moments: what their own rounding amounts to
+ROUNDING = 1e-13  # relative ridge on second moments, as large as their own rounding
 RANK = 1e-11  # directions of the record below this share of the largest are rounding
 Segments = Sequence[np.ndarray]
 
@@ -47,7 +47,7 @@ class Lagged(NamedTuple):
         return np.arange(self.R.shape[1] - self.p, self.R.shape[1])
 
     def lags(self, first: int, last: int) -> np.ndarray:
-        """Columns of w(t-first) ... w(t-last); lag 0 is w(t) itself."""
+        """Returns the columns of w(t-first) ... w(t-last); lag 0 is w(t) itself."""
         q, start = self.m + self.p, self.m if self.feedthrough else 0
         past = [start + (lag - 1) * q + np.arange(q) for lag in range(max(first, 1), last + 1)]
         return np.concatenate([np.r_[self.now_u, self.now_y], *past] if first == 0 else past)
@@ -149,7 +149,7 @@ def _moment_factor(runs, past, columns, mean, rows) -> np.ndarray:
     try:
         return np.linalg.cholesky(S / np.outer(scale, scale) + ROUNDING * np.eye(len(S))).T * scale
     except np.linalg.LinAlgError:
-        # a channel's movement is lost in the rounding of its mean: the rows themselves, with the same ridge
+        # a channel moves less than its mean rounds, so the rows themselves are used, with the same ridge
         return np.linalg.qr(
             np.vstack([_exact_factor(runs, past, columns, mean, rows), np.sqrt(ROUNDING) * np.diag(scale)]),
             mode="r",
@@ -165,7 +165,7 @@ def one_step(data: Lagged, past: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns the coefficients (features, p) of the one-step predictor with the first `past` lags (and u(t)
     with feed-through), and its errors as rows of the factor."""
     features = np.concatenate([data.now_u if data.feedthrough else [], data.lags(1, past)]).astype(int)
-    k = len(features)  # the features lead the columns, so the factor is already theirs
+    k = len(features)  # the features are the first columns, so the factor already belongs to them
     if data.exact:
         coefficients = np.linalg.lstsq(data.R[:, features], data.R[:, data.now_y], rcond=RANK)[0]
     else:
@@ -224,7 +224,7 @@ def realise(
         proper = ~np.asarray(direct, bool)
         C[proper], D[proper] = _least_squares(x, y[:, proper]), 0.0
     if data.exact:
-        # errors are rounding and tell nothing of K: the window's own predictor has the gain of y(t-1)
+        # errors are rounding and do not determine K; the window's own predictor has the gain of y(t-1)
         AB = _least_squares(np.hstack([x, u]), x_next)
         A, B, K = AB[:, :n], AB[:, n:], basis[:, m : m + data.p]
     else:

@@ -26,18 +26,17 @@ from pipeline.temperature.identification.refinement import (
 from pipeline.temperature.identification.subspace import Segments, lagged, realise, subspace
 from pipeline.temperature.plant import Plant, markov_parameters
 
-RESAMPLED_STEPS = (
-    1  # of Gauss-Newton a resampled record: from a consistent start one is efficient (Le Cam 1956)
-)
+# Gauss-Newton steps for a resampled record: from a consistent start one is efficient (Le Cam 1956)
+RESAMPLED_STEPS = 1
 QUANTILE_99 = 2.5758  # of the standard normal, two-sided
-# Quarters: of 20 simulated machines, 90 % bands of gains held the truth in 98 % in white noise, 88 % beside a
-# drift and 96 % where it also hides an input that hardly moved. Eighths are short beside a drift: 98, 80 and
-# 94 %. The bootstrap alone: 81, 54 and 64 %
+# Measured on 20 simulated machines: with quarters, 90 % bands of gains contained the true gain in 98 % of
+# cases in white noise, 88 % with a drift, and 96 % if the drift also hides an input that hardly moved. With
+# eighths: 98, 80 and 94 %, too few with a drift. With the bootstrap alone: 81, 54 and 64 %
 LEFT_OUT_BLOCKS = 4
-# errors of one step below this share of the output's movement are rounding: what colour they have is the
-# processor's, and no record of a sensor comes near (float32 resolves 1e-7)
+# one-step errors below this share of the output's movement are rounding: their correlation comes from the
+# processor, and no sensor's record is so exact (float32 resolves 1e-7)
 ROUNDING = 1e-8
-ADDS = 0.1  # of the error: what the inputs must take off that of the free response for a fit to be theirs
+ADDS = 0.1  # share by which the inputs must lower the error of the free response to explain a fit
 
 
 class Residuals(NamedTuple):
@@ -234,7 +233,7 @@ def left_out_plants(u: Segments, y: Segments, identified, *, blocks: int = LEFT_
             continue
         try:
             plants.append(_reidentified(left_u, left_y, identified, identified.order))
-        except ValueError:  # what is left of the record is too short
+        except ValueError:  # the rest of the record is too short
             return []
     return plants
 
@@ -332,7 +331,7 @@ def advice(
                 "the model misses more than half of its movement; "
                 "look for an input or disturbance that is not recorded"
             )
-        # the recorded inputs take less than `ADDS` off the error of the free response
+        # the recorded inputs lower the error of the free response by less than `ADDS`
         if still_percent is not None and 100.0 - fit_percent[o] > (1.0 - ADDS) * (100.0 - still_percent[o]):
             sentences.append(
                 f"the fit of {output} on the hold-out, {fit_percent[o]:.0f} %, is that of the free response "
@@ -396,7 +395,7 @@ def _of_inputs_left(
     ]
 
 
-LEVEL = 0.9  # of every band here
+LEVEL = 0.9  # of every band from here on
 ENDS = ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
 
 
@@ -599,13 +598,13 @@ def steps(
     times = np.where(significant, np.concatenate([shapes[:1], np.quantile(shapes[1:], ENDS, axis=0)]), np.nan)
     grid = np.arange(0, samples + 1, -(-samples // points))
     response, low, high = (part[grid] for part in bands)
-    # equal ratios: what a controller meets first counts as much as what a drift does in the end
+    # equal ratios: the start, which matters to a controller, counts as much as a late drift
     ratios = np.unique(np.geomspace(1, samples, points).round().astype(int))
     models = of_step_responses(ratios, np.stack([part[ratios] for part in responses], axis=1))
     return Steps(grid, response, low, high, gain, peak, times[:, 0], times[:, 1], significant, models)
 
 
-# no heated part outlives it: an input whose whole range moves an output by more was not identified
+# no heated part survives it: if an input's whole range moves an output by more, the gain is wrong
 LARGEST_RISE_DEGC = 2000.0
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.temperature.test_set.scorecard import chosen
 
-# limits that a simulation of the temperature loop can check, as the comparison resolves them
+# limits that a simulation of the temperature loop can check
 CHECKED = (
     "settled_error_degC",
     "peak_error_degC",
@@ -20,7 +20,7 @@ CHECKED = (
     "disk_margin",
     "delay_margin_s",
 )
-# controllers of one structure: of two that pass the one with the larger margins may be named
+# pairs of controllers of one structure: if both pass, only the one with the larger margins may be best
 SAME_STRUCTURE = (("pi_simc", "pi"),)
 
 
@@ -40,7 +40,7 @@ def best_by_limits(
     bears_less = {name: pair[1 - pair.index(name)] for name, pair in weaker.items() if name}
     eligible = {name: held and not able.get(bears_less.get(name, ""), False) for name, held in able.items()}
     rows = {name: table["contestant"] == name for name in order}
-    # a cost that is missing is without end
+    # a missing cost is infinite
     costs = {
         name: np.where(np.isnan(table["cost"][at]), np.inf, table["cost"][at]) for name, at in rows.items()
     }

@@ -13,12 +13,13 @@ from pipeline.temperature.settings import TuneWeights
 from pipeline.temperature.test_set import panel, scorecard, tuning
 from pipeline.temperature.test_set.panel import CaseConditions, play
 
-# of a parameter's range, in logarithms: so near to an end the search is called bound by it
+# share of a parameter's range, in logarithms: a result this near to an end lies at a bound
 AT_BOUND = 0.02
-# of the cost, for a parameter moved from its start by its whole range: of two candidates as good as each
-# other the one nearer to the start is taken, so that a direction in which the cost is flat has one end
+# share of the cost added for a parameter that is its whole range away from its start: of two equally good
+# candidates the one nearer to the start is taken, so that the result is unique where the cost is flat
 NEARER = 0.05
-# of the candidates, the last, by a pattern search from the best: without it two seeds end 6 % apart
+# share of the candidates, the last ones, for a pattern search from the best: without it two seeds end 6 %
+# apart
 POLISHED = 1 / 3
 
 
@@ -29,7 +30,7 @@ def search(
     if it cannot be designed or every candidate fails, and an empty one if the record does not allow it."""
     controller = table.BY_NAME[name]
     low, start, high = table.bounds(controller, problem)
-    # a kernel may have no minimum at the start, and one where inputs cost more
+    # a kernel may have no minimum at the start, but one with a larger weight on inputs
     for theta in (start, np.sqrt(start * high), high):
         try:
             design = controller.design(problem, table.parameters(controller, theta))
@@ -64,7 +65,7 @@ def search(
             start=first,
         )
         return name, tuning.polished(cost, result, low, high, evaluations=last)
-    except ValueError as failure:  # every candidate failed: the others go on
+    except ValueError as failure:  # every candidate failed; other controllers continue
         return name, str(failure)
 
 

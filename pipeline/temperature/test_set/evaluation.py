@@ -32,7 +32,7 @@ CONVENTION = (
 )
 
 
-OF_SEARCH = ("at_bound", "evaluations", "cost", "cost_at_start", "failed", "q", "r")  # and no parameters
+OF_SEARCH = ("at_bound", "evaluations", "cost", "cost_at_start", "failed", "q", "r")  # not parameters
 
 
 class ControllerOutcome(NamedTuple):
@@ -63,7 +63,7 @@ def _gaps(design: Design, setting: panel.CaseConditions) -> np.ndarray | None:
         return None
     try:
         law = design.plain()
-    except ValueError:  # no minimum at the yardstick's weights, though there is one at its own
+    except ValueError:  # no minimum at the weights of the common cost, although there is one at its own
         return None
     cases, (p, m) = setting.rehearsal.judging, (design.model.p, design.model.m)
     first = np.flatnonzero(cases.kind == "constant")[:1]
@@ -203,7 +203,7 @@ def decide(
     index = scorecard.deciding_plant(costs[one], costs[two], block)
     rest = block != index
     without = {name: values[rest] for name, values in costs.items()}
-    # structures take turns over the plants
+    # plants have one structure in turn
     kind = block % len(panel.STRUCTURES)
     pair = _pair(a, b, costs, block, kind, summary, seed)
     mine = np.flatnonzero(block == index)
@@ -299,8 +299,8 @@ def trajectory_columns(
     return columns
 
 
-REDESIGNS = 7  # plants of the spread that a controller is designed from anew
-BROKEN = 2.0  # times the cost, from which a record that cannot be told from this one gives another controller
+REDESIGNS = 7  # plants of the spread from which a controller is designed again
+BROKEN = 2.0  # times the cost: from there on, an equally plausible record gives a different controller
 
 
 def redesigned(
@@ -320,7 +320,7 @@ def redesigned(
     def cost(plant: Plant) -> float:
         try:
             made = BY_NAME[name].design(problem._replace(plant=plant), values)
-        except ValueError:  # this plant allows no such controller
+        except ValueError:  # no such controller for this plant
             return float("inf")
         if made is None:
             return float("inf")

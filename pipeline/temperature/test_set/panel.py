@@ -56,12 +56,12 @@ from pipeline.temperature.test_set.scenario_defaults import (
 )
 from pipeline.temperature.tracking import Law, reached_state
 
-RESTLESS = 1e-8  # reciprocal condition of I - A below which a plant has no rest of its own
-# the surroundings while a reference is held: from, until (shares of the run), share of the rise by which they
-# are colder: a door, a part fan, another room
+RESTLESS = 1e-8  # reciprocal condition number of I - A below which a plant has no steady state of its own
+# the surroundings get colder while a reference is held: from, until (shares of the run), and by which share
+# of the rise: a door, a part fan, another room
 DOOR, FAN, ROOM = (0.1, 0.15, 0.15), (0.3, 0.5, 0.08), (0.6, 1.0, 0.03)
 MOVES = ("ramp", "sinusoid", "disturbed")  # cases without a step of the reference
-GLANCE = 5  # samples: what is outside the band for fewer is noise that the controller answers
+GLANCE = 5  # samples: shorter excursions from the band are the controller's response to noise
 
 
 class Structure(NamedTuple):
@@ -80,7 +80,7 @@ class Structure(NamedTuple):
     duty: float = 0.0
 
 
-# of the plants, in turn
+# the plants have these in turn
 STRUCTURES = (
     Structure(),
     Structure(wall=0.1),
@@ -89,8 +89,8 @@ STRUCTURES = (
     Structure(step_degC=0.25, duty=0.01),
 )
 LATE, DEAD = 0.03, 3
-# the largest lag in series of a plant, as a share of its quickest mode of heat: a cartridge in its bore takes
-# 2 to 13 s, a sensor 1 to 5 s, a hot end that was identified as one mode 130 to 430 s
+# the largest series lag of a plant, as a share of its quickest time constant of heat. For comparison: a
+# cartridge in its bore 2 to 13 s, a sensor 1 to 5 s, a hot end identified as one mode 130 to 430 s
 LAG = 0.05
 
 
@@ -234,7 +234,7 @@ def drawn(
     return plants
 
 
-NEARER = (1.0, 0.5, 0.25, 0.125, 0.0)  # shares of the spread that are tried
+NEARER = (1.0, 0.5, 0.25, 0.125, 0.0)  # tried shares of the spread
 
 
 def corners(nominal: Sequence[Plant], spread: PlantSpread) -> tuple[list[Plant], Strength]:
@@ -300,7 +300,7 @@ class Cases(NamedTuple):
 
     @property
     def cold(self) -> np.ndarray:
-        """Whether a case (s,) is a start from cold."""
+        """Whether a case (s,) starts from cold."""
         return (self.kind == "constant") & (self.start == 0)
 
 
@@ -439,7 +439,7 @@ def _held(
     if limits is None:
         return np.r_[x, u], u
     within, balance = np.clip(u, limits.low, limits.high), np.eye(inner.n) - inner.A
-    # a plant that nearly integrates drifts slowly from where it is, and has no rest worth a start
+    # a plant that nearly integrates drifts slowly, and its steady state would be no useful start
     if np.any(within != u) and np.linalg.cond(balance) < 1 / RESTLESS:
         x = np.linalg.solve(balance, inner.B @ within + inner.b)
     return np.r_[x, within], within
@@ -739,7 +739,7 @@ def conditions(
     disturbances."""
     band = rehearsal.band_degC / settings.band_degC
     late = (rehearsal.settling_s or settings.settling_s) / settings.settling_s
-    # a slow machine is allowed its time, a small one its degrees
+    # the allowance scales with the settling limit and with the band
     allowance = {
         "outside": tuning.allow_settling_s * late / machine.sample_time_s,
         "overshoot": tuning.allow_overshoot_degC * band,
@@ -749,7 +749,7 @@ def conditions(
         "travel": tuning.allow_travel_percent,
         "rms": tuning.allow_overshoot_degC * band,
     }
-    # nearer to a reference than its noise no forecast can tell an overshoot
+    # an overshoot within the noise cannot be forecast
     overshoot = max(tracking.governor_overshoot_degC * band, 3 * float(rehearsal.noise.max()))
     return CaseConditions(
         rehearsal,
@@ -944,10 +944,10 @@ def _half(
     )
 
 
-# of the recorded span, by which the ambient is varied at most where recordings do not differ by more: what
-# spans 12 °C was not recorded in a room that may be 8 °C warmer
+# largest variation of the ambient as a share of the recorded span, if recordings do not differ by more: a
+# record that spans 12 °C is not from a room that may be 8 °C warmer
 AMBIENT_SHARE = 0.25
-HOLDABLE = (1.0, 0.75, 0.5, 0.25, 0.1)  # shares of it that are tried
+HOLDABLE = (1.0, 0.75, 0.5, 0.25, 0.1)  # tried shares of that variation
 
 
 def _ambient(

@@ -16,30 +16,28 @@ from pipeline.temperature.identification.first_order import time_constant
 from pipeline.temperature.identification.refinement import one_step_errors, simulated
 from pipeline.temperature.plant import Plant, hold_output, strictly_proper
 
-RANGE = (0.01, 0.99)  # quantiles that count as recorded: a spike, or one sample of a start, is none
-ONE_DEVIATION = (0.1587, 0.8413)  # quantiles of a normal one standard deviation either side of its median
-MIDDLE = 0.5  # of the recorded span, where a reference is changed
-LOWER_SHARE = 0.15  # of the recorded span, by which the second reference lies below the first
-# as an open loop needs to come within 5 % of its end; the delay counts as the step and its answer are late
+RANGE = (0.01, 0.99)  # quantiles of the recorded range, so that a spike or one sample does not set it
+ONE_DEVIATION = (0.1587, 0.8413)  # normal quantiles one standard deviation below and above the median
+MIDDLE = 0.5  # of the recorded span: the middle start
+LOWER_SHARE = 0.15  # of the recorded span: how far the second reference lies below the first
+# time of an open loop to come within 5 % of its end; the delay counts twice, for the step and its response
 SETTLING = (3.0, 2.0)  # time constants, delays
-BAND_NOISE = 3.0  # standard deviations: a sensor's noise alone leaves it once in 370 samples
-BAND_SHARE = 0.01  # of the recorded span, where a sensor is better than the machine needs
-WIDEST_BAND_DEGC = (
-    1.0  # no print tells less; where noise asks for more the true outputs are judged all the same
-)
-TIME_CONSTANTS = 8.0  # in a case: 3 to settle, 3 to settle again, and the last sixth of what is then left
+BAND_NOISE = 3.0  # standard deviations: noise alone leaves the band once in 370 samples
+BAND_SHARE = 0.01  # of the recorded span, if a sensor is better than the machine needs
+# a smaller difference does not show in a print. More noise does not widen the band: true outputs are judged
+WIDEST_BAND_DEGC = 1.0
+TIME_CONSTANTS = 8.0  # in a case: 3 to settle, 3 to settle again, and the last sixth, the settled window
 STEPS = (600, 3000)
-PERIOD = (
-    4.0  # time constants of a sinusoid: two periods fit, and its heat flow is twice that of holding still
-)
-REACHED_DEGC = 0.1  # a reference that is missed by less is reached: no sensor here shows it
-# of an input's limit, in a reference that is not the owner's: with 15 % less gain it can still be held
+# time constants in a period of the sinusoid: two periods fit; its heat flow is twice that of holding still
+PERIOD = 4.0
+REACHED_DEGC = 0.1  # a reference missed by less counts as reached: no sensor here shows the difference
+# of an input's limit, kept free at a reference that the owner did not choose: it can still be held with 15 %
+# less gain
 HEADROOM = 0.15
-FLOOR_SHARE = (
-    0.05  # of an input's range above its lowest: in a room that is a little warmer it can still be held
-)
-BEYOND = 1e3  # times as dear as missing a reference: crossing a declared limit of an output
-LEAK = 1e-9  # a step, by which a plant that only integrates is taken to leak, so that it has a steady state
+# of an input's range, kept free above its lowest: a reference can still be held in a slightly warmer room
+FLOOR_SHARE = 0.05
+BEYOND = 1e3  # crossing a declared limit of an output costs this many times as much as missing a reference
+LEAK = 1e-9  # assumed leak per step of a plant that only integrates, so that it has a steady state
 
 
 class MachineScale(NamedTuple):
@@ -114,7 +112,7 @@ def machine_scale(
     taus = [time_constant(u, [b[:, o] for b in y], sample_time_s=sample_time_s) for o in range(p)]
     low, high = np.nanquantile(np.vstack(y), RANGE, axis=0)
     below, above = np.nanquantile(np.vstack(one_step_errors(model, u, y)), ONE_DEVIATION, axis=0)
-    # larger errors than those of the reading before are faults of the model, no noise of a sensor
+    # errors larger than the change since the last reading come from the model, not from the sensor
     repeated = np.sqrt(np.nanmean(np.vstack([np.diff(b, axis=0) for b in y]) ** 2, axis=0))
     return MachineScale(
         np.minimum(taus, longest),
@@ -180,7 +178,7 @@ def defaults(
     if (missed := np.abs(reached - asked) > REACHED_DEGC).any():
         held_back = np.where(missed, _nearest(model, asked, careful)[0], asked)
         first, u_first = _nearest(model, held_back, bounds)
-        # a zone within reach may need the heat of one that is held back
+        # a zone within reach may need the heat of a zone whose reference is lowered
         entries = [
             _missed(model, int(o), asked, reached, first, (u if missed[o] else u_first), bounds)
             for o in np.flatnonzero(missed | (np.abs(first - asked) > REACHED_DEGC))
@@ -279,7 +277,7 @@ def _nearest(model: Plant, r: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, n
     G, g = steady_map(model)
     p, m, one = model.p, model.m, np.eye(model.p)
     none, size = np.zeros((p, p)), 1 / np.maximum(np.abs(G).max(axis=0), np.finfo(float).tiny)
-    G = G * size  # inputs in units of the °C that they make
+    G = G * size  # inputs in units of their effect in °C
     rows = np.vstack([np.hstack([G, -one, none]), np.hstack([-G, -one, none])])
     right = np.r_[r - g, g - r]
     for sign, limit in ((1.0, bounds.output_high), (-1.0, bounds.output_low)):

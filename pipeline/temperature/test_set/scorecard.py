@@ -60,7 +60,7 @@ def simulate(panel: Scenarios, law: Law) -> Run:
     x, noise = panel.x0.copy(), np.broadcast_to(panel.noise, (panel.hold + steps, scenarios, p))
     held = np.einsum("sij,sj->si", C, x) + d
     z = panel.u0 @ law.start_u.T + (held + noise[0]) @ law.start_y.T + law.start
-    # the memory of a window is a shift: as a sparse matrix it costs a copy, not a product
+    # the memory of a window is a shift; as a sparse matrix it costs only a copy, not a product
     memory = scipy.sparse.csr_array(law.A.T) if np.count_nonzero(law.A) < 0.05 * law.A.size else law.A.T
     for t in range(panel.hold):
         z = z @ memory + panel.u0 @ law.B_u.T + (held + noise[t]) @ law.B_y.T + panel.r @ law.B_r.T + law.c
@@ -118,15 +118,15 @@ class Margins(NamedTuple):
     stable: bool
 
 
-DOUBLINGS = 14  # of the power of a loop that shows that it decays
-AT_ONCE = 16  # plants, the loops of which are in memory together
+DOUBLINGS = 14  # of the power of A by which `is_stable` shows that a loop decays
+AT_ONCE = 16  # plants whose loops are in memory together
 
 
 def margins(plants: Sequence[Plant], law: Law, *, grid: int = 240) -> list[Margins]:
     """Returns the margins of the law on each plant; both are 0 if the loop is unstable. Disk margin: 1 / max
     |S - I/2| (Seiler, Packard, Gahinet 2020, skew 0). Delay margin: min (pi + arg lambda(L)) / omega over
     |lambda(L)| = 1. `grid`: number of frequencies."""
-    # rad a step: even in logarithms where loops of heaters cross, then even to pi
+    # rad a step: logarithmic in the range where loops of heaters cross, then linear up to pi
     slow = np.geomspace(1e-4, 0.3, grid // 2, endpoint=False)
     omega = np.concatenate([slow, np.linspace(0.3, np.pi, grid - grid // 2)])
     z = np.exp(1j * omega)
@@ -251,7 +251,7 @@ def _delay_margin(omega: np.ndarray, loci: np.ndarray) -> float:
     lag = np.minimum(
         (np.angle(loci[:-1]) + np.pi) / omega[:-1, None], (np.angle(loci[1:]) + np.pi) / omega[1:, None]
     )
-    # a delay of whole samples turns the locus at pi by pi a sample: where it is larger than one there, it
+    # a delay of whole samples turns the locus at pi by pi a sample. If the locus is larger than one there, it
     # meets -1 without crossing the circle
     last = (np.angle(loci[-1]) + np.pi) / omega[-1]
     lags = np.concatenate([lag[crossing], last[size[-1] > 1]])

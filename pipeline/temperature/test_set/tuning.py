@@ -92,7 +92,7 @@ def _posterior_slopes(gp: _Surrogate, x: np.ndarray) -> tuple[float, float, np.n
 def _surrogate(points: np.ndarray, values: np.ndarray, kernel) -> _Surrogate:
     """Returns scikit-learn's process at fixed kernel parameters, kernel = variance * Matern(length) +
     noise."""
-    # here: the import takes seconds, and few callers search
+    # imported here because it takes seconds, and few callers search
     from sklearn.gaussian_process import GaussianProcessRegressor
 
     fitted = GaussianProcessRegressor(kernel, alpha=1e-10, optimizer=None).fit(points, values)
@@ -149,7 +149,7 @@ def _log_improvement(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-# an acquisition takes mean and standard deviation to (a, da/dmean, da/dstd); the least a is evaluated next
+# an acquisition maps mean and standard deviation to (a, da/dmean, da/dstd); the smallest a is evaluated next
 
 
 def _expected_improvement(mean, std, *, best: float):
@@ -227,7 +227,7 @@ class _TrustRegion(NamedTuple):
 
 def _design(rng: np.random.Generator, d: int, count: int) -> np.ndarray:
     """Returns the first points (count, d): a scrambled Sobol sequence."""
-    from scipy.stats import qmc  # here: the import takes seconds
+    from scipy.stats import qmc  # imported here because it takes seconds
 
     return qmc.Sobol(d, scramble=True, rng=rng).random_base2(int(np.ceil(np.log2(count))))[:count]
 
@@ -318,7 +318,7 @@ def minimise(
     span = np.log(upper / lower)
     nothing = History(np.empty((0, d)), np.empty(0), (), np.empty(0))
     start, history = nothing if start is None else start, nothing
-    # a generator for each candidate: what is drawn does not depend on where a run was stopped
+    # a generator for each candidate, so that its random numbers do not depend on where a run was stopped
     first, *later = rng.spawn(1 + evaluations)
     design, region, fitted = _design(first, d, initial), _TrustRegion(), False
     kernel = _kernel(np.full(d, np.sqrt(d)), noise=1e-6, variance=10.0)
