@@ -251,10 +251,10 @@ def closed_loop(
     aimed at r (p,) and holds it; and the largest share of (sample, input) at a limit over the members. noise
     (T, p): added to the outputs that the controller measures.
 
-    Every member runs with all gains up, all down, and each alone up and down; with the ambient unchanged, or
-    moved (`ambient`) up with the gains and down with them; and with its inputs on time, and late. It starts
-    at rest, held by the law. A member that the law cannot hold there starts as near as it can. The forecast
-    ends when an output leaves `stop`.
+    Every member runs with unchanged gains and the ambient unchanged, up and down (`ambient`); with all gains
+    and the ambient up, and all down; and with each gain alone up and down. Its inputs act on time, and late.
+    It starts at rest, held by the law. A member that the law cannot hold there starts as near as it can. The
+    forecast ends when an output leaves `stop`.
     """
     m, asked = family.model.m, family.asked
     gains = np.vstack([np.zeros((3, m)), np.ones(m), -np.ones(m), np.eye(m), -np.eye(m)])
@@ -687,8 +687,8 @@ def expected_gap(model: Plant, taught: Lesson, gamma: float) -> float:
 
 
 def design(family: Family, rng: np.random.Generator) -> Experiment:
-    """Returns the longest safe experiment that moves the machine by a fair share of the wanted amplitudes. If
-    no length does, returns the one that teaches most."""
+    """Tries the requested length, and shorter ones by halving, until a safe experiment moves every input by a
+    fair share of its wanted amplitude. Returns the tried experiment that teaches most."""
     if reason := _nothing_left(family):
         nothing, unknown = np.zeros((0, family.model.m)), np.full(family.model.p, np.nan)
         still = np.zeros(family.model.m)
