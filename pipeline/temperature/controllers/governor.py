@@ -61,10 +61,10 @@ def governor(
     of any `strength` within its range.
 
     The uncertainty of the innovations follows the sensors' noise, at least a tenth of a degree. The observer
-    assumes that process noise enters through the inputs, that the sensors are tau percent^2 of every input
-    noisier, and that the drift w changes per step by `drift` of the largest effect of a percent of every
-    input; so units do not matter. A machine that responds more slowly is observed for longer, in proportion
-    to the furthest instant ahead.
+    assumes that process noise enters through the inputs, and that sensor noise is as large as the effect of
+    tau percent^2 on every input. It assumes that the drift w changes per step by `drift` of the largest
+    effect of a percent of every input. So units do not matter. A machine that responds more slowly is
+    observed for longer, in proportion to the furthest instant ahead.
     """
     at, unsure = instants(family), np.maximum(outputs.margin, 0.1)
     slower = max(at[-1] / UNHURRIED, 1.0)
@@ -135,9 +135,9 @@ def observer(
     plant: Plant, *, tau: float, drift: float, leak: float, lags: int = LONGEST
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns A, C of the state [x; w], and M (n + p, p), the immediate correction of the state per
-    innovation. Process noise enters through the inputs, the sensors are tau percent^2 of every input noisier,
-    and the drift changes per step by `drift` of the largest effect of a percent of every input within `lags`
-    steps."""
+    innovation. Process noise enters through the inputs. Sensor noise is as large as the effect of tau
+    percent^2 on every input. The drift changes per step by `drift` of the largest effect of a percent of
+    every input within `lags` steps."""
     A, C = drifting(plant, leak)
     pulse = (np.abs(markov_parameters(plant, lags)).max(axis=0) ** 2).sum(axis=1)
     noise = scipy.linalg.block_diag(plant.B @ plant.B.T, drift**2 * np.diag(pulse))
