@@ -1,11 +1,12 @@
-"""Paired tests and intervals: is the challenger better than the champion beyond noise?
+"""Paired tests and intervals: is one controller (challenger) better than another (champion) beyond chance?
 
-Both ran the same cases. Cases that share a plant, a part or a recording are one block, and the blocks are
+Both ran the same cases. Cases that share a plant, a part or a recording form one block, and the blocks are
 independent.
 
-d_b = mean over the cases of block b of log(champion's cost / challenger's cost). Under
-"no difference" every d_b is as likely with either sign: the sign-flip test (Fisher
-1935), exact for up to 14 blocks and by draws beyond.
+d_b = mean over the cases of block b of log(champion's cost / challenger's cost)
+
+Without a difference, every d_b is equally likely with either sign. The sign-flip test uses this (Fisher
+1935). It is exact for up to 14 blocks, and uses random samples of signs beyond.
 """
 
 from collections.abc import Sequence
@@ -14,14 +15,14 @@ from typing import NamedTuple
 import numpy as np
 import scipy.special
 
-# up to so many blocks all 2^n signs are tried
+# the largest number of blocks for which all 2^n signs are tried
 EXACT = 14
 
 
 class Paired(NamedTuple):
-    """Improvement of the mean cost in percent with the ends of its 90 % interval (Student's t over blocks).
+    """Improvement of the mean cost in percent, with the ends of its 90 % interval (Student's t over blocks).
 
-    `p` is the one-sided probability that chance alone does as well.
+    `p` is the one-sided probability of at least this improvement by chance alone.
     """
 
     improvement_percent: float
@@ -40,10 +41,12 @@ def paired(
     rng: np.random.Generator,
     draws: int = 20_000,
 ) -> Paired:
-    """The challenger's improvement over the champion, from costs (cases,) above 0; less is better.
+    """Returns the improvement of the challenger over the champion, from costs (cases,) above 0; lower is
+    better. `block`: the block of each case; `draws`: random sign vectors beyond EXACT blocks.
 
-    An infinite cost of the challenger counts as a thousand times the champion's. Raises ValueError for a
-    champion's cost that is not finite and above 0, and for a negative one of the challenger.
+    If the challenger's cost is infinite, it counts as a thousand times the champion's. Raises ValueError if
+    there is no case, if a cost of the champion is not finite and above 0, or if one of the challenger is
+    negative.
     """
     champion, challenger = np.asarray(champion, float), np.asarray(challenger, float)
     if len(champion) == 0 or not (
@@ -69,7 +72,7 @@ def paired(
 
 
 def blocks_needed(level: float) -> int:
-    """The smallest number of blocks with which a sign-flip test can reach `level`: 2^-n <= level."""
+    """Returns the smallest number of blocks with which a sign-flip test can reach `level`: 2^-n <= level."""
     return int(np.ceil(np.log2(1 / level)))
 
 
@@ -82,7 +85,8 @@ class Share(NamedTuple):
 
 
 class PooledShare(NamedTuple):
-    """A share of runs in percent with its 95 % interval; n runs that share nothing tell it as well."""
+    """A share of runs in percent with its 95 % interval. It is as precise as the share of n independent
+    runs."""
 
     percent: float
     low: float
@@ -91,19 +95,20 @@ class PooledShare(NamedTuple):
 
 
 def wilson(happened: np.ndarray) -> Share:
-    """The share of True (n,) in percent with its 95 % interval, for n that share nothing (Wilson 1927)."""
+    """Returns the share of True (n,) in percent with its 95 % interval, for n independent runs (Wilson
+    1927)."""
     return wilson_interval(float(np.mean(happened)), len(happened))
 
 
 def wilson_interval(p: float, n: float) -> Share:
-    """The interval of a share p of n, n > 0, which need not be whole (an effective number).
+    """Returns the interval of a share p of n, n > 0. n may be an effective number, not whole.
 
     (p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)
     """
     z = float(scipy.special.ndtri(0.975))
     centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
-    # of none or all one end is the share itself, which rounding would miss
+    # if p is 0 or 1, one end is p itself, which rounding would miss
     low, high = min(float(max(centre - half, 0.0)), p), max(float(min(centre + half, 1.0)), p)
     return Share(100.0 * p, 100.0 * low, 100.0 * high)
 
@@ -117,10 +122,13 @@ class Mean(NamedTuple):
 
 
 def effective(happened: np.ndarray) -> float:
-    """As how many runs that share nothing do n runs on each of P pools tell a share? happened (P, n).
+    """Returns how many independent runs give a share as precisely as n runs on each of P pools do. happened
+    (P, n).
 
-    n P / max(1, var(p_k) / (p (1 - p) / n)): what the pools' shares p_k differ by, against what runs that
-    share nothing differ by (design effect: Kish 1965). One pool says nothing of others: 1.
+    n P / max(1, var(p_k) / (p (1 - p) / n))
+
+    The ratio compares the variance of the pools' shares p_k with that of independent runs (design effect:
+    Kish 1965). One pool counts as 1, because it says nothing about other pools.
     """
     happened = np.asarray(happened, float)
     pools, n = happened.shape
@@ -134,15 +142,17 @@ def effective(happened: np.ndarray) -> float:
 
 
 def pooled_share(happened: np.ndarray) -> PooledShare:
-    """The share of True (P, n) in percent, worth `effective` runs, with its 95 % interval: Wilson's, widened
-    by Student's t of P - 1 (Korn and Graubard 1998)."""
+    """Returns the share of True (P, n) in percent, its 95 % interval, and n, the `effective` number of
+    runs. The interval is Wilson's, widened by Student's t with P - 1 degrees of freedom (Korn and Graubard
+    1998)."""
     pools, n = len(happened), effective(happened)
     student = scipy.special.stdtrit(max(pools - 1, 1), 0.975) / scipy.special.ndtri(0.975)
     return PooledShare(*wilson_interval(float(np.mean(happened)), n / student**2), n)
 
 
 def mean_of_pools(values: np.ndarray, *, level: float) -> Mean:
-    """The mean of values (P,) of pools that share nothing, with the ends of its interval (Student's t)."""
+    """Returns the mean of values (P,) of independent pools, with the ends of its interval at `level`
+    (Student's t)."""
     mean, pools = float(np.mean(values)), len(values)
     half = scipy.special.stdtrit(pools - 1, (1 + level) / 2) * np.std(values, ddof=1) / np.sqrt(pools)
     return Mean(mean, mean - float(half), mean + float(half))

@@ -1,4 +1,4 @@
-"""Loop 1, temperature: a record of inputs and outputs -> a law `u = -K z - D y - K_r r - k`.
+"""Loop 1, temperature: from a record of inputs and outputs to a control law `u = -K z - D y - K_r r - k`.
 
 Source: Zavrakli, Parnell, Dey 2023. Every method takes and returns arrays. Inputs u (T, m) are in percent,
 outputs y (T, p) in °C, T samples; a record is a list of such segments, each without a gap.
@@ -38,7 +38,7 @@ Baseline: PI by the SIMC rules.
 >>> pairs = temperature.pairing(model, np.zeros(1), np.full(1, 100.0), horizon=300)
 >>> pi = temperature.pi_law(pairs, inputs=1)
 
-The disk margin of a loop says by how much gain and phase may change before it oscillates.
+The disk margin of a loop says how much gain and phase may change before the loop becomes unstable.
 
 >>> for name, law in {"LQG": lqg, "VARX": varx, "kernel": kernel, "PI": pi}.items():
 ...     print(f"{name}: {temperature.margins([model], law)[0].disk:.1f}")

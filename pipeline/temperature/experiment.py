@@ -1,22 +1,24 @@
-"""The next experiment: what to play on a machine so that it teaches most about gains and time constants while
-no output of any plant of the identified family leaves its limits.
+"""Designs the next experiment: the inputs to play on a machine so that the record teaches most about gains
+and time constants, while no output of any plant of the identified family leaves its limits.
 
 centre: A linear programme over the family: the centre and the common share of the wanted amplitudes that keep
-    every output within its limits at a few instants. First the largest share, then, at ENOUGH of it, the
-    centre whose temperatures are nearest to the references.
-signal: A random binary sequence that holds for a share of the fastest time constant that its input shows, or
-    a multisine up to a few times its corner frequency: no power where the plant does not answer.
+    every output within its limits at a few instants. First the largest share is found. Then, at ENOUGH of it,
+    the centre whose temperatures are nearest to the references.
+signal: A random binary sequence that holds for a share of the fastest time constant of its input, or
+    a multisine up to a few times its corner frequency: no power where the plant does not respond.
 amplitude: Scaled down until the forecast (`forecast`) over the whole experiment stays within the limits; then
-    inputs that can move more without leaving them, one by one. Where a long experiment allows little, a
-    shorter one is tried: what hardly settles drifts away with time.
-teaches: Fisher information of gain and time constant of each pair that is seen, on first-order models.
+    inputs that can move more without leaving them are increased, one by one. If a long experiment allows
+    little, a shorter one is tried, because a machine that hardly settles drifts away with time.
+teaches: Fisher information of gain and time constant of each pair with a clear effect, on first-order models.
 
-Forecast, open loop: an output of one member is linear in the inputs: what is left of its state, and the
-answer R_j to each input alone from now on, M_j to that input's moves away from its last value. Its bounds are
+Forecast, open loop: an output of one member is linear in the inputs. It is the sum of what remains of its
+state, the response R_j to each input alone from now on, and M_j to that input's moves away from its last
+value. Its bounds are
 
     y +- (g sum_j |R_j| + sum_j |M_j(t) - M_j(t - delay)| + ambient (1 - e^(-t / tau)) + band)
 
-with g the doubt about gains, which act on all heat from now on: exact in the gains, no narrower in the rest.
+with g the uncertainty of the gains, which acts on all heat from now on. The bounds are exact in the gains,
+and conservative in the other terms.
 """
 
 from collections.abc import Sequence
@@ -42,19 +44,19 @@ from pipeline.temperature.identification.validation import horizon, step_respons
 from pipeline.temperature.plant import Plant, padded, strictly_proper
 from pipeline.temperature.tracking import Law, aimed, gains
 
-TAIL = 3000  # samples at the end of the record that the present state is taken from
-LATEST = 20  # samples at its very end by which each member is set right
-STORED = 6e6  # numbers of a family's responses that are held at once; beyond, every k-th sample is looked at
+TAIL = 3000  # samples at the end of the record from which the present state is estimated
+LATEST = 20  # samples at its very end from which the bias of each member is computed
+STORED = 6e6  # numbers of a family's responses kept at once; beyond it only every k-th sample is kept
 SURE = 0.99  # share of the record's simulation errors that the band holds
-SIGMAS = 3.0  # of the sensor's noise
+SIGMAS = 3.0  # standard deviations of the sensor's noise
 
 
 class Wish(NamedTuple):
-    """What is asked for: at most `samples` samples of this kind of signal, amplitudes of at most
-    `amplitude_percent`, inputs that move by at most `rate_percent_per_step` and are held for no fewer than
-    `shortest_steps`. And what a family identified from one record does not hold: input gains that are 1 +-
-    doubt_input_gain times as large from now on, an ambient that moves by +- doubt_ambient_degC, inputs that
-    act up to doubt_delay_steps later."""
+    """The requested experiment: at most `samples` samples of this kind of signal, amplitudes of at most
+    `amplitude_percent`, inputs that change by at most `rate_percent_per_step` and are held for at least
+    `shortest_steps`. Also the uncertainty that a family identified from one record does not cover: gains 1 +-
+    doubt_input_gain times as large from now on, an ambient that moves by +- doubt_ambient_degC, and inputs
+    that act up to doubt_delay_steps later."""
 
     samples: int
     signal: Literal["multisine", "prbs"]
@@ -67,7 +69,7 @@ class Wish(NamedTuple):
 
 
 class Start(NamedTuple):
-    """Where the record leaves the machine: its last inputs u (m,) and outputs y (p,), and state x (n,) and
+    """The machine at the end of the record: its last inputs u (m,) and outputs y (p,), and state x (n,) and
     bias (p,) of each member."""
 
     u: np.ndarray
@@ -77,10 +79,9 @@ class Start(NamedTuple):
 
 
 class Answers(NamedTuple):
-    """A family's outputs at the samples `at` (k,): `free` (members, k, p) without any input; `step`, `ramp`
-    and `probe` (members, m, k, p) to one percent of each input alone, held from the start, risen along the
-    ramp, or played as the probing signal. `peak` (members, p, m): the largest |probe|.
-    """
+    """A family's outputs at the samples `at` (k,). `free` (members, k, p): without any input. `step`, `ramp`
+    and `probe` (members, m, k, p): response to one percent of each input alone, held from the start, raised
+    along the ramp, or played as the probing signal. `peak` (members, p, m): the largest |probe|."""
 
     at: np.ndarray
     free: np.ndarray
@@ -91,15 +92,15 @@ class Answers(NamedTuple):
 
 
 class Extremes(NamedTuple):
-    """Highest and lowest (p,) of every output over a family, in °C."""
+    """Highest and lowest values (p,) of every output over a family, in °C."""
 
     highest: np.ndarray
     lowest: np.ndarray
 
 
 def start(family: Sequence[Plant], u: Segments, y: Segments) -> Start:
-    """The end of a record u (T, m), y (T, p), masked samples NaN. Raises ValueError where no stretch of it
-    has all inputs."""
+    """Returns the state of the machine at the end of a record u (T, m), y (T, p); masked samples are NaN.
+    Raises ValueError if no stretch of the record has all inputs."""
     us, ys = gapless(u, y)
     if not us:
         raise ValueError("no stretch of the record has all inputs, so nobody knows where the machine stands")
@@ -114,14 +115,14 @@ def start(family: Sequence[Plant], u: Segments, y: Segments) -> Start:
 
 
 def _mean(rows: np.ndarray) -> np.ndarray:
-    """Mean (p,) of what is measured; 0 where nothing is."""
+    """Returns the mean (p,) of the measured values; 0 if nothing is measured."""
     measured = np.isfinite(rows)
     return np.where(measured, rows, 0.0).sum(axis=0) / np.maximum(measured.sum(axis=0), 1)
 
 
 class Band(NamedTuple):
-    """Of each output (p,) in °C: standard deviation of the sensor's noise, and what the model's simulation
-    missed of the record at most, noise included."""
+    """For each output (p,) in °C: `noise`, the standard deviation of the sensor's noise, and `error`, the
+    largest simulation error of the model on the record (quantile SURE), noise included."""
 
     noise: np.ndarray
     error: np.ndarray
@@ -132,7 +133,8 @@ class Band(NamedTuple):
 
 
 def band(model: Plant, u: Segments, y: Segments) -> Band:
-    """Of the record that the model was identified from; a stretch too short for its state is passed over."""
+    """Computes the Band from the record of the identification. Stretches too short for the model's state are
+    skipped."""
     us, ys = gapless(u, y)
     long_enough = [k for k, a in enumerate(us) if len(a) > 3 * model.n] or [
         int(np.argmax(list(map(len, us))))
@@ -141,7 +143,7 @@ def band(model: Plant, u: Segments, y: Segments) -> Band:
     errors = np.vstack([b - simulated(model, a, b) for a, b in zip(us, ys, strict=True)])
     with np.errstate(over="ignore", invalid="ignore"):
         ahead = np.nanstd(np.vstack(one_step_errors(model, us, ys)), axis=0)
-    # a predictor that runs away says nothing of the noise: what simulation misses is then its upper end
+    # an unstable predictor does not show the noise; the simulation error is then its upper limit
     noise = np.fmin(ahead, np.nanstd(errors, axis=0))
     return Band(noise, np.nanquantile(np.abs(errors), SURE, axis=0))
 
@@ -152,7 +154,8 @@ def band(model: Plant, u: Segments, y: Segments) -> Band:
 def answers(
     family: Sequence[Plant], begin: Start, ramp: np.ndarray, signal: np.ndarray, *, stored: float = STORED
 ) -> Answers:
-    """The family's answers over the experiment: ramp (T,) from 0 to 1, signal (T, m) of one percent."""
+    """Computes the family's responses over the experiment. ramp (T,): from 0 to 1; signal (T, m): of one
+    percent. `stored`: how many numbers may be kept; beyond it only every k-th sample is."""
     samples, m = signal.shape
     p = family[0].p
     stride = int(np.ceil(3 * len(family) * m * p * samples / stored))
@@ -170,7 +173,7 @@ def answers(
 
 
 def _alone(plant: Plant, signal: np.ndarray) -> np.ndarray:
-    """Outputs (m, T, p) to each column of signal (T, m) alone, from zero and without offsets."""
+    """Returns the outputs (m, T, p) for each column of signal (T, m) alone, from zero and without offsets."""
     zero = np.zeros(plant.n)
     return np.stack(
         [
@@ -183,7 +186,7 @@ def _alone(plant: Plant, signal: np.ndarray) -> np.ndarray:
 
 
 def truncated(whole: Answers, samples: int) -> Answers:
-    """The answers over the first `samples` samples."""
+    """Returns the responses over the first `samples` samples."""
     last = int(np.searchsorted(whole.at, samples - 1, side="right"))
     step, ramp, probe = (part[:, :, :last] for part in (whole.step, whole.ramp, whole.probe))
     peak = np.abs(probe).max(axis=2).transpose(0, 2, 1)
@@ -191,20 +194,20 @@ def truncated(whole: Answers, samples: int) -> Answers:
 
 
 def ambient(family: "Family", at: np.ndarray) -> np.ndarray:
-    """How far the ambient may have moved each output at the samples `at`: (k,) in °C."""
+    """Returns how far in °C the ambient may have moved each output at the samples `at` (k,)."""
     return family.asked.doubt_ambient_degC * -np.expm1(-at / max(family.pace.fastest, 1e-9))
 
 
 def open_loop(family: "Family", reach: Answers, centre: np.ndarray, amplitude: np.ndarray) -> Extremes:
-    """Extremes under the ramp from the last inputs to `centre` (m,) and the signal of `amplitude` (m,) about
-    it."""
+    """Returns the extremes for a ramp from the last inputs to `centre` (m,) and the signal of `amplitude`
+    (m,) around it."""
     begin = family.begin
     moves = (centre - begin.u)[:, None, None] * reach.ramp + amplitude[:, None, None] * reach.probe
     return _bounds(family, reach.free, begin.u[:, None, None] * reach.step + moves, moves, reach.at)
 
 
 def forecast(family: "Family", u: np.ndarray) -> Extremes:
-    """Extremes under the inputs u (T, m) themselves, every sample looked at."""
+    """Returns the extremes for the inputs u (T, m) themselves, over every sample."""
     at, begin = np.arange(len(u)), family.begin
     none = np.column_stack([np.zeros_like(u), np.ones(len(u))])
     of_members = []
@@ -219,9 +222,9 @@ def forecast(family: "Family", u: np.ndarray) -> Extremes:
 def _bounds(
     family: "Family", free: np.ndarray, of_each: np.ndarray, moves: np.ndarray, at: np.ndarray
 ) -> Extremes:
-    """Extremes of free (members, k, p) and what each input adds, of_each (members, m, k, p), with the doubt
-    about its gain, and about the delay of its moves, of the same shape; with the ambient, and the band of
-    noise and model error."""
+    """Returns the extremes of free (members, k, p) plus the response to each input, of_each (members, m, k,
+    p). Includes the uncertainty of the gains (on of_each), of the delay (on moves, of the same shape) and of
+    the ambient, and the band of noise and model error."""
     asked = family.asked
     moved = ambient(family, at)[:, None] + family.band.width
     reach = asked.doubt_input_gain * np.abs(of_each).sum(axis=1) + moved
@@ -244,14 +247,14 @@ def closed_loop(
     *,
     stop: Extremes | None = None,
 ) -> tuple[Extremes, float]:
-    """Extremes of the true outputs while dither (T, m) is added to the commands of a law that is aimed at r
-    (p,) and holds it, and the largest share of (sample, input) at a limit over the members; noise (T, p) is
-    what the controller measures beside them.
+    """Returns the extremes of the true outputs while dither (T, m) is added to the commands of a law that is
+    aimed at r (p,) and holds it; and the largest share of (sample, input) at a limit over the members. noise
+    (T, p): added to the outputs that the controller measures.
 
-    Every member runs with all gains up, all down, and each alone up and down; with the ambient as it was, or
-    moved (`ambient`) up with the gains and down with them; its inputs on time, and late. It starts at rest,
-    held by the law; a member that the law cannot hold there starts as near as it can. The forecast ends where
-    an output leaves `stop`.
+    Every member runs with unchanged gains and the ambient unchanged, up and down (`ambient`); with all gains
+    and the ambient up, and all down; and with each gain alone up and down. Its inputs act on time, and late.
+    It starts at rest, held by the law. A member that the law cannot hold there starts as near as it can. The
+    forecast ends when an output leaves `stop`.
     """
     m, asked = family.model.m, family.asked
     gains = np.vstack([np.zeros((3, m)), np.ones(m), -np.ones(m), np.eye(m), -np.eye(m)])
@@ -276,9 +279,9 @@ def _run(
     late: int,
     stop: Extremes | None,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Highest and lowest (p,), and the largest limited share, of plants of one order, run side by side; held:
-    law, reference, limits of the inputs; driven: dither, noise, and by how much the ambient moves each plant
-    (T, plants)."""
+    """Simulates plants of one order side by side. Returns the highest and lowest outputs (p,), and the
+    largest limited share. held: law, reference, limits of the inputs; driven: dither, noise, and how much the
+    ambient moves each plant (T, plants); late: samples by which inputs act later."""
     (law, r, (low, high)), (dither, noise, disturbance) = held, driven
     A, B, C, D = (np.stack([getattr(plant, name) for plant in plants]) for name in "ABCD")
     b, d = (np.stack([getattr(plant, name) for plant in plants]) for name in "bd")
@@ -291,7 +294,7 @@ def _run(
         y = np.einsum("kpn,kn->kp", C, x) + np.einsum("kpm,km->kp", D, u) + d
         y += disturbance[t][:, None]
         highest, lowest = np.maximum(highest, y.max(axis=0)), np.minimum(lowest, y.min(axis=0))
-        if not np.abs(y).max() < 1e6:  # a loop that runs away has left every limit
+        if not np.abs(y).max() < 1e6:  # an unstable loop has left every limit
             break
         if stop is not None and ((highest > stop.highest) | (lowest < stop.lowest)).any():
             break
@@ -300,7 +303,7 @@ def _run(
         applied = np.clip(wanted, low, high)
         limited += (applied != wanted).mean(axis=1)
         z = z @ law.A.T + applied @ law.B_u.T + measured @ law.B_y.T + r @ law.B_r.T + law.c
-        # an integrator that would push a cut command further rests (conditional integration)
+        # an integrator that would push a limited command further rests (conditional integration)
         moved = law.integral * (r - measured)
         further = ((-moved @ law.K_r.T) * (wanted - applied)).max(axis=1) > 0
         xi = xi + np.where(further[:, None], 0.0, moved)
@@ -313,14 +316,14 @@ def _run(
 def _at_rest(
     plant: Plant, law: Law, r: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """State, memory, integrator and input of a plant that the law holds with its outputs as near the
+    """Returns state, memory, integrator and input of a plant that the law holds, with its outputs as near the
     reference as its integrator can bring them."""
     balance = np.eye(plant.n) - plant.A
     if np.linalg.cond(balance) > 1e13:
         balance = balance + 1e-9 * np.eye(plant.n)
     gain = plant.C @ np.linalg.solve(balance, plant.B) + plant.D
     offset = plant.C @ np.linalg.solve(balance, plant.b) + plant.d
-    # the law at rest on its reference asks for u = held - K_r xi
+    # at rest at its reference the law commands u = held - K_r xi
     held = -law.k - law.D @ r - law.K_r @ r
     z = np.zeros(len(law.A))
     if len(law.A):
@@ -332,20 +335,20 @@ def _at_rest(
 
 
 ENOUGH = 0.5  # of the largest safe amplitude: the rest is given up to come nearer to the references
-SEEN = 0.05  # of an output's largest effect: pairs below it teach and are asked nothing
+SEEN = 0.05  # of an output's largest effect: pairs below it are ignored
 HOLD = 0.5  # of the fastest time constant: the shortest hold of a binary sequence
 CORNERS = 3.0  # times the corner frequency: the highest line of a multisine
-LINES = 12  # of each input in a multisine at least: fewer are told by their own past
-SWITCHES = 20  # at least so many holds in an experiment, so that inputs move independently
-DRAWS = 30  # phases drawn for a multisine, of which the flattest is taken
+LINES = 12  # least number for each input in a multisine: fewer can be predicted from their own past
+SWITCHES = 20  # least number of holds in an experiment, so that inputs move independently
+DRAWS = 30  # random sets of phases tried for a multisine; the flattest is taken
 USEFUL = 0.3  # largest expected standard error of an input's strongest gain; beyond it nothing is learned
 STEPS = 6  # halvings of each search for an amplitude
 FAIR = 0.4  # of the wanted amplitudes: a shorter experiment is tried below it
 
 
 class Pace(NamedTuple):
-    """Time constants and delays (p, m) in samples, gains (p, m) in °C per percent, the median over the
-    family; `seen` (p, m): pairs that count; fastest and slowest time constant of those."""
+    """Time constants and delays (p, m) in samples and gains (p, m) in °C per percent, as medians over the
+    family. `seen` (p, m): pairs with a clear effect; `fastest`, `slowest`: time constants of those."""
 
     time_constant: np.ndarray
     delay: np.ndarray
@@ -356,9 +359,9 @@ class Pace(NamedTuple):
 
 
 class Lesson(NamedTuple):
-    """What an experiment would teach: smallest eigenvalue of the Fisher information of the logarithms of gain
-    and time constant over all seen pairs, and their expected standard errors (p, m) as shares, NaN where not
-    seen."""
+    """What an experiment would teach. `information`: smallest eigenvalue of the Fisher information of the
+    logarithms of gain and time constant over all pairs with a clear effect. `gain_error`,
+    `time_constant_error` (p, m): their expected standard errors as shares, NaN for other pairs."""
 
     information: float
     gain_error: np.ndarray
@@ -366,8 +369,9 @@ class Lesson(NamedTuple):
 
 
 class Experiment(NamedTuple):
-    """Inputs u (T, m) to play, empty with the reason where no safe experiment teaches anything; extremes of
-    every output over the family, in °C; the temperatures that the centre holds by the model, target (p,)."""
+    """An experiment. `u` (T, m): inputs to play; empty, with a `reason`, if no safe experiment teaches
+    anything. `extremes`: of every output over the family, in °C. `target` (p,): temperatures that the model
+    holds at the `centre`."""
 
     u: np.ndarray
     reason: str
@@ -383,8 +387,8 @@ class Experiment(NamedTuple):
 
 
 class Dither(NamedTuple):
-    """What to add to the commands of the running controller, u (T, m), empty with the reason where it is not
-    safe; extremes, amplitude (m,), and the share of commands at a limit."""
+    """The signal u (T, m) to add to the commands of the running controller; empty, with a `reason`, if it is
+    not safe. Also the extremes, the amplitude (m,), and the share of commands at a limit."""
 
     u: np.ndarray
     reason: str
@@ -394,10 +398,10 @@ class Dither(NamedTuple):
 
 
 class Family(NamedTuple):
-    """The identified plants, the model first; their pace; where the record leaves the machine; the band of
-    noise and model error. Then what the experiment is for: what is asked of it, with the doubt about what the
-    plants do not hold; the limits of inputs low and high (m,) in percent and of outputs y_low and y_high (p,)
-    in °C, the references (p,), and a given centre (m,); the names of inputs and outputs."""
+    """The identified plants, the model first; their pace; the state of the machine at the end of the record;
+    the band of noise and model error. Then the task: `asked`, the requested experiment with the uncertainty
+    that the plants do not cover; limits of inputs low and high (m,) in percent and of outputs y_low and
+    y_high (p,) in °C; the references (p,); a given centre (m,) or None; the names of inputs and outputs."""
 
     plants: Sequence[Plant]
     pace: Pace
@@ -431,12 +435,12 @@ def family_of(
     centre: list[float] | None = None,
     names: tuple[Sequence[str], Sequence[str]],
 ) -> Family:
-    """The family for experiments on the machine of this record (u, y); limits, names: low and high of the
-    inputs, then of the outputs, as in Family.
+    """Returns the family for experiments on the machine of this record (u, y). limits: low and high of the
+    inputs, then of the outputs; names: of inputs, then of outputs.
 
-    A pole of the model outside the unit circle is drawn onto it, as in the bootstrap: no heated part heats
-    itself. Where the machine does run away, the model then misses the record, and the band says so. Raises
-    ValueError where no stretch of the record has all inputs.
+    A pole of the model outside the unit circle is moved onto it, as in the bootstrap, because no heated part
+    heats itself. If the machine does run away, the model misses the record, and the band shows it. Raises
+    ValueError if no stretch of the record has all inputs.
     """
     plants = [stabilised(plant, LARGEST_RADIUS) for plant in plants]
     speed = pace(plants, limits[1] - limits[0], asked.samples)
@@ -445,7 +449,8 @@ def family_of(
 
 
 def pace(plants: Sequence[Plant], reach: np.ndarray, longest: int) -> Pace:
-    """How fast the family answers; reach (m,) is each input's range, longest the samples of an experiment."""
+    """Returns how fast the family responds. reach (m,): range of each input; longest: samples of an
+    experiment."""
     samples = horizon(plants[0], longest)
     responses = [step_response(plant, samples + 1) for plant in plants]
     tau, delay = (np.median(part, axis=0) for part in zip(*map(two_points, responses), strict=True))
@@ -461,8 +466,9 @@ def pace(plants: Sequence[Plant], reach: np.ndarray, longest: int) -> Pace:
 
 
 def signal(rng: np.random.Generator, samples: int, asked: Wish, speed: Pace) -> np.ndarray:
-    """(samples, m) of amplitude 1 and about zero mean, with its power where each input is answered."""
-    # the fastest time constant that each input shows; the fastest of all where it shows none
+    """Returns a signal (samples, m) of amplitude 1 and about zero mean, with its power at the frequencies to
+    which the outputs respond."""
+    # the fastest time constant of each input's clear effects; the fastest of all if it has none
     tau = np.where(speed.seen, speed.time_constant, np.inf).min(axis=0)
     tau = np.where(np.isfinite(tau), tau, speed.fastest)
     if asked.signal == "prbs":
@@ -473,15 +479,15 @@ def signal(rng: np.random.Generator, samples: int, asked: Wish, speed: Pace) -> 
 
 
 def _binary(rng: np.random.Generator, samples: int, hold: int) -> np.ndarray:
-    """+-1 in holds of equal length, as many up as down, in random order."""
+    """Returns +-1 in holds of equal length, as many up as down, in random order."""
     count = -(-samples // hold)
     bits = rng.permutation(np.arange(count) % 2)
     return np.repeat(2.0 * bits - 1.0, hold)[:samples]
 
 
 def _lines(samples: int, highest: np.ndarray) -> list[np.ndarray]:
-    """Lines of the record for each input up to its highest frequency in rad a sample, none shared; at least
-    LINES each."""
+    """Returns the frequency lines of each input, up to its highest frequency in rad a sample; at least LINES
+    each. No two inputs share a line."""
     m = len(highest)
     last = np.ceil(highest * samples / (2 * np.pi))
     last = np.clip(last, min(LINES * m, (samples - 1) // 2), (samples - 1) // 2).astype(int)
@@ -489,7 +495,8 @@ def _lines(samples: int, highest: np.ndarray) -> list[np.ndarray]:
 
 
 def _flattest(rng: np.random.Generator, samples: int, lines: np.ndarray) -> np.ndarray:
-    """The sum of these lines in equal power, of all phases drawn the one with the least peak, scaled to 1."""
+    """Returns the sum of these lines in equal power, scaled to a peak of 1. Of DRAWS random sets of phases it
+    takes the one with the smallest peak."""
     best, least = np.zeros(samples), np.inf
     for _ in range(DRAWS):
         spectrum = np.zeros(samples // 2 + 1, complex)
@@ -502,8 +509,8 @@ def _flattest(rng: np.random.Generator, samples: int, lines: np.ndarray) -> np.n
 
 
 def shaped(family: "Family", rng: np.random.Generator, samples: int, ramp: int) -> np.ndarray:
-    """The signal (samples, m) of amplitude 1 from the end of the ramp on, within the rate of the inputs at
-    the amplitude that is asked."""
+    """Returns the signal (samples, m) of amplitude 1 from the end of the ramp on, within the rate of the
+    inputs at the requested amplitude."""
     raw, rate = signal(rng, samples, family.asked, family.pace), family.asked.rate_percent_per_step
     step = rate / max(family.asked.amplitude_percent, rate / 2)
     out, last = np.zeros_like(raw), np.zeros(raw.shape[1])
@@ -517,8 +524,9 @@ def shaped(family: "Family", rng: np.random.Generator, samples: int, ramp: int) 
 
 
 def caps(family: Family, reach: Answers) -> np.ndarray:
-    """Amplitudes (m,) that are wanted: the asked one, or what moves an output by half of what its limits
-    leave beside band and ambient; 0 where they leave nothing."""
+    """Returns the wanted amplitudes (m,): the smallest of the requested one, half of the input's range, and
+    what moves an output by half of the range that its limits leave beside band and ambient. 0 if they leave
+    nothing."""
     spare = family.y_high - family.y_low - 2 * (family.band.width + family.asked.doubt_ambient_degC)
     peak = reach.peak.max(axis=0) * (1 + family.asked.doubt_input_gain)
     room = np.maximum(spare, 0.0)[:, None] / 2 / np.maximum(peak, np.finfo(float).tiny)
@@ -530,8 +538,8 @@ def caps(family: Family, reach: Answers) -> np.ndarray:
 def programme(
     family: Family, reach: Answers, cap: np.ndarray, least: float | None
 ) -> tuple[np.ndarray, float] | None:
-    """Centre (m,) and share of the wanted amplitudes by a linear programme; None where no centre is within
-    the limits even without a signal.
+    """Returns the centre (m,) and the share of the wanted amplitudes by a linear programme. Returns None if
+    no centre is within the limits even without a signal.
 
     Unknowns [centre; w >= |centre|; q >= |y - reference|; share]. Without `least` the share is maximised;
     with it the distance q from the references is minimised at a share of at least that.
@@ -543,13 +551,13 @@ def programme(
     at_u = reach.free[:, instants].reshape(-1) + from_step.sum(axis=1)
     swing = (1 + g) * np.repeat(reach.peak[:, None], len(instants), axis=1).reshape(-1, m) @ cap
     moved = ambient(family, reach.at[instants])[:, None] + family.band.width
-    # the ramp answers as if the centre had come from zero; what the last inputs leave beside it dies away
+    # `rise` assumes a ramp from zero; what the last inputs add to that decays
     beside = np.abs(from_step - rise * begin.u).sum(axis=1)
     slack = np.tile(moved[None], (len(reach.free), 1, 1)).reshape(-1) + g * beside
     count = len(at_u)
     high, low = (np.tile(side, count // p) for side in (family.y_high, family.y_low))
     none = np.zeros((count, p))
-    # y = at_u + rise (centre - u), and the doubt about it
+    # y = at_u + rise (centre - u), and its uncertainty
     upper = np.hstack([rise, g * np.abs(rise), none, swing[:, None]])
     lower = np.hstack([-rise, g * np.abs(rise), none, swing[:, None]])
     rows = [upper, lower]
@@ -574,8 +582,8 @@ def programme(
 
 
 def centres(family: Family, reach: Answers, cap: np.ndarray) -> list[np.ndarray]:
-    """Centres (m,) to try in this order: the one that is given; else that of the linear programme, what holds
-    the references by the model, and the last inputs."""
+    """Returns the centres (m,) to try, in this order. If a centre is given, only that one. Otherwise that of
+    the linear programme, then the inputs that hold the references by the model, then the last inputs."""
     if family.centre is not None:
         return [np.clip(family.centre, family.low, family.high)]
     held = feasible_target(family.model, family.reference, family.low, family.high).u
@@ -592,12 +600,12 @@ def within(extremes: Extremes, family: Family) -> bool:
 
 
 def safe_amplitude(family: Family, reach: Answers, centre: np.ndarray, cap: np.ndarray) -> np.ndarray:
-    """The largest amplitudes (m,) found that stay within the limits: a common share of `cap` first, then each
-    input as far as it can beyond that; 0 where even the centre alone leaves them."""
+    """Returns the largest amplitudes (m,) found within the limits: first a common share of `cap`, then each
+    input as far beyond that as possible. Returns 0 if even the centre alone leaves the limits."""
     room = np.minimum(cap, np.maximum(np.minimum(family.high - centre, centre - family.low), 0.0))
 
     def largest(amplitude, toward):
-        """How far from `amplitude` toward `toward` is safe, between 0 and 1."""
+        """Returns the safe share, 0 to 1, of the way from `amplitude` to `toward`."""
         safe, beyond = 0.0, 1.0
         if within(open_loop(family, reach, centre, toward), family):
             return 1.0
@@ -623,8 +631,9 @@ def safe_amplitude(family: Family, reach: Answers, centre: np.ndarray, cap: np.n
 
 
 def lesson(u: np.ndarray, speed: Pace, noise: np.ndarray) -> Lesson:
-    """Of inputs u (T, m) about rest: with z the first-order answer of one pair, dy / d log K = z and
-    dy / d log tau by central differences; a constant of each output is projected out. noise (p,) in °C."""
+    """Returns what inputs u (T, m) about rest would teach. With z the first-order response of one pair, dy /
+    d log K = z, and dy / d log tau follows by central differences. A constant of each output is projected
+    out. noise (p,) in °C."""
     information, errors = np.inf, np.full((2, *speed.seen.shape), np.nan)
     for o, pairs in enumerate(speed.seen):
         inputs = np.flatnonzero(pairs)
@@ -645,9 +654,9 @@ def lesson(u: np.ndarray, speed: Pace, noise: np.ndarray) -> Lesson:
 
 
 def expected_gap(model: Plant, taught: Lesson, gamma: float) -> float:
-    """J / J* - 1, to second order, of linear-quadratic gains (Q = R = I) designed after the experiment: the
-    sum over its expected errors of each input's gain and of the time constants, one at a time. Started from
-    what the inputs move."""
+    """Returns the expected J / J* - 1, to second order, of linear-quadratic gains (Q = R = I) designed after
+    the experiment: the sum over its expected errors of each input's gain and of the time constants, one at a
+    time. The cost is that of initial states B, which unit pulses of the inputs reach."""
     plant = strictly_proper(model)
     Q, R = np.eye(plant.p), np.eye(plant.m)
 
@@ -678,8 +687,8 @@ def expected_gap(model: Plant, taught: Lesson, gamma: float) -> float:
 
 
 def design(family: Family, rng: np.random.Generator) -> Experiment:
-    """The longest experiment that is safe and moves the machine by a fair share of what is wanted; of
-    shorter ones the one that teaches most where none does."""
+    """Tries the requested length, and shorter ones by halving, until a safe experiment moves every input by a
+    fair share of its wanted amplitude. Returns the tried experiment that teaches most."""
     if reason := _nothing_left(family):
         nothing, unknown = np.zeros((0, family.model.m)), np.full(family.model.p, np.nan)
         still = np.zeros(family.model.m)
@@ -703,8 +712,8 @@ def design(family: Family, rng: np.random.Generator) -> Experiment:
 
 
 def _nothing_left(family: Family) -> str:
-    """Why no experiment can be forecast: the model itself misses the record by what the limits are apart;
-    empty where it does not."""
+    """Returns why no experiment can be forecast: the model itself misses the record by more than the limits
+    are apart. Empty if it does not."""
     spare = family.y_high - family.y_low - 2 * family.band.width
     o = int(np.argmin(np.where(np.isfinite(spare), spare, -np.inf)))
     if spare[o] > 0:
@@ -716,13 +725,15 @@ def _nothing_left(family: Family) -> str:
 
 
 def ramp_samples(family: Family, samples: int) -> int:
-    """Samples of the ramp: the widest range of an input within the rate, half of the experiment at most."""
+    """Returns the samples of the ramp: the widest range of an input within the rate, at most half of the
+    experiment."""
     needed = np.ceil((family.high - family.low).max() / family.asked.rate_percent_per_step)
     return int(max(min(needed, samples / 2), 1))
 
 
 def _designed(family: Family, reach: Answers, shapes: tuple[np.ndarray, np.ndarray, int]) -> Experiment:
-    """The experiment of one length; shapes: ramp (T,), signal (T, m), and where the ramp ends."""
+    """Returns the experiment of one length; shapes: ramp (T,), signal (T, m), and the sample at which the
+    ramp ends."""
     ramp, played, rise = shapes
     cap = caps(family, reach)
     tried = centres(family, reach, cap)
@@ -740,7 +751,7 @@ def _designed(family: Family, reach: Answers, shapes: tuple[np.ndarray, np.ndarr
         extremes = forecast(family, u)
         if within(extremes, family):
             break
-        amplitude = 0.9 * amplitude  # between the samples that the search looked at it was hotter
+        amplitude = 0.9 * amplitude  # between the samples of the search it was hotter
     else:
         return _left(family, reach, centre)
     taught = lesson(u[rise:], family.pace, family.band.noise)
@@ -751,7 +762,7 @@ def _designed(family: Family, reach: Answers, shapes: tuple[np.ndarray, np.ndarr
 
 
 def _teaches_little(family: Family, amplitude: np.ndarray, taught: Lesson) -> str:
-    """Why an experiment is not worth playing; empty where it is."""
+    """Returns why an experiment is not worth playing; empty if it is."""
     error = np.where(np.isnan(taught.gain_error), np.inf, taught.gain_error).min(axis=0)
     weak = np.flatnonzero((error > USEFUL) & family.pace.seen.any(axis=0))
     if not weak.size:
@@ -765,7 +776,8 @@ def _teaches_little(family: Family, amplitude: np.ndarray, taught: Lesson) -> st
 
 
 def _left(family: Family, reach: Answers, centre: np.ndarray) -> Experiment:
-    """The refusal of an experiment whose centre alone leaves a limit, with the output that leaves it most."""
+    """Returns the refusal of an experiment whose centre alone leaves a limit, with the output that leaves it
+    most."""
     still = np.zeros(family.model.m)
     extremes = open_loop(family, reach, centre, still)
     above, below = extremes.highest - family.y_high, family.y_low - extremes.lowest
@@ -793,8 +805,8 @@ def _left(family: Family, reach: Answers, centre: np.ndarray) -> Experiment:
 
 
 def dither(family: Family, law: Law, rng: np.random.Generator) -> Dither:
-    """The signal to add to the commands of a controller such as `law` that holds the references, or the
-    nearest that the inputs can hold; its amplitudes are halved until the forecast around the family stays
+    """Returns the signal to add to the commands of a controller such as `law`, which holds the references or
+    the nearest that the inputs can hold. Its amplitudes are halved until the forecast over the family stays
     within the limits."""
     m, samples = family.model.m, family.asked.samples
     rise = ramp_samples(family, samples)

@@ -1,5 +1,5 @@
-"""The plant of loop 1: a state-space model of heaters and motor -> barrel temperatures, the constants of the
-BAAM study, simulation and plant spread."""
+"""The plant of loop 1: a state-space model from heaters and motor to barrel temperatures, with the constants
+of the BAAM study, simulation, rank tests and steady states."""
 
 from collections.abc import Sequence
 
@@ -10,8 +10,8 @@ from pipeline.temperature.controllers.law import Plant
 
 
 def plant(A, B, C, D=None, b=None, d=None, K=None, sample_time_s: float = 1.0) -> Plant:
-    """A Plant with the shapes checked; what is left out is zero. Raises ValueError naming the matrix, the
-    shape expected and the shape found."""
+    """Returns a Plant with checked shapes; omitted arrays are zero. Raises ValueError that names the matrix,
+    the expected shape and the shape found, or the matrix with a number that is not finite."""
     A, B, C = (np.atleast_2d(np.asarray(M, float)) for M in (A, B, C))
     n, m, p = A.shape[0], B.shape[1], C.shape[0]
     expected = {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m), "b": (n,), "d": (p,), "K": (n, p)}
@@ -34,8 +34,8 @@ def plant(A, B, C, D=None, b=None, d=None, K=None, sample_time_s: float = 1.0) -
 
 
 def baam() -> Plant:
-    """The big-area extruder of seed 1, (44) and (45): six heated cells and a motor -> five sensors; by
-    convention one step is 1 s and u is in percent."""
+    """Returns the big-area extruder of seed 1, (44) and (45): six heated cells and a motor -> five sensors.
+    By convention one step is 1 s and u is in percent."""
     A = np.diag([0.992, 0.9919, 1.0009, 0.9979, 0.9972, 0.9953])
     A[0, 1], A[1, 0], A[1, 2], A[2, 1], A[2, 3], A[3, 2] = 0.0018, 0.0023, 0.0043, -0.0042, 0.0024, 0.0013
     B = np.column_stack(
@@ -68,7 +68,7 @@ def simulate(plant: Plant, u: np.ndarray, x0: np.ndarray) -> tuple[np.ndarray, n
 
 def markov_parameters(plant: Plant, lags: int) -> np.ndarray:
     """h (lags, p, m) with h[k-1] = C A^(k-1) B, the response of y at lag k to a unit pulse of u."""
-    # columns A^k B in blocks that double: two products where there were `lags`
+    # columns A^k B in blocks that double: two products per doubling instead of one per lag
     columns, power = plant.B, plant.A
     while columns.shape[1] < lags * plant.m:
         columns, power = np.hstack([columns, power @ columns]), power @ power
@@ -77,8 +77,8 @@ def markov_parameters(plant: Plant, lags: int) -> np.ndarray:
 
 
 def clip_spectral_radius(A: np.ndarray, radius: float) -> np.ndarray:
-    """A with every eigenvalue beyond `radius` drawn back onto it along its ray, in the modal basis, or in
-    Schur's if there is no modal one, as of a plant with dead times."""
+    """Returns A with every eigenvalue beyond `radius` moved onto it along its ray. Works in the modal basis,
+    or in Schur's if there is no modal basis, as for a plant with dead times."""
     eigenvalues, T = np.linalg.eig(A)
     size = np.abs(eigenvalues)
     if size.max() <= radius:
@@ -92,7 +92,7 @@ def clip_spectral_radius(A: np.ndarray, radius: float) -> np.ndarray:
         shrunk = radius * (1 - 1e-9) / np.maximum(np.abs(diagonal), 1e-300)
         np.fill_diagonal(upper, diagonal * np.minimum(shrunk, 1.0))
         A_clipped = np.real(Z @ upper @ Z.conj().T)
-    # a defective A has no modal basis to draw in
+    # a defective A has no exact modal basis, so a pole may still lie outside
     return A_clipped * min(1.0, radius * (1 - 1e-9) / np.abs(np.linalg.eigvals(A_clipped)).max())
 
 
@@ -117,7 +117,8 @@ def _rank_test(matrix: np.ndarray, n: int, name: str, remedy: str) -> tuple[int,
 
 
 def observability(plant: Plant) -> tuple[int, str]:
-    """The rank of (7), and the reason where some state never shows in y, empty where all do."""
+    """Returns the rank of (7), and the reason if some state never affects y; the reason is empty if all
+    do."""
     return _rank_test(
         observability_matrix(plant.A, plant.C, plant.n),
         plant.n,
@@ -127,8 +128,8 @@ def observability(plant: Plant) -> tuple[int, str]:
 
 
 def observable_part(plant: Plant) -> Plant:
-    """The plant without the states that never show in y, which move no other state: its inputs and outputs
-    are related as before. The delays of an input that no output answers leave such states."""
+    """Returns the plant without the states that never affect y, now or later. Inputs and outputs are related
+    as before. For example, the delays of an input that no output answers are such states."""
     rank, hidden = observability(plant)
     if not hidden:
         return plant
@@ -137,8 +138,8 @@ def observable_part(plant: Plant) -> Plant:
 
 
 def controllability(plant: Plant) -> tuple[int, str]:
-    """The rank of [B AB ... A^(n-1)B] (10), and the reason where some state obeys no input, empty where all
-    do."""
+    """Returns the rank of [B AB ... A^(n-1)B] (10), and the reason if no input moves some state; the reason
+    is empty if inputs move every state."""
     return _rank_test(
         observability_matrix(plant.A.T, plant.B.T, plant.n),
         plant.n,
@@ -148,8 +149,9 @@ def controllability(plant: Plant) -> tuple[int, str]:
 
 
 def bandwidth_rad_s(plant: Plant) -> float | None:
-    """The frequency in rad/s above which the largest singular value of y = G u is below 0.707 of its steady
-    value; None if it is nowhere below, up to half the sampling rate, or the plant never comes to rest."""
+    """Returns the frequency in rad/s above which the largest singular value of y = G u is below 0.707 of its
+    steady value. Returns None if it is not below that up to half the sampling rate, or if the plant never
+    comes to rest."""
     import control  # takes a second to load
 
     T = plant.sample_time_s
@@ -163,11 +165,11 @@ def bandwidth_rad_s(plant: Plant) -> float | None:
 
 
 def strictly_proper(plant: Plant) -> Plant:
-    """The plant as a controller meets it: each output is sampled just before the input of its step is
-    applied, so that D u acts on it one sample later, as the state w(t+1) = u(t).
+    """Returns the plant as the controller samples it. Each output is sampled just before the input of its
+    step is applied, so D u acts on it one sample later, as the state w(t+1) = u(t).
 
-    y(t) = C x(t) + D u(t-1) + d: what the input before left in the output is still there when the next one is
-    computed from it. Only as many states are added as D has rank. A plant without D is returned as it is.
+    y(t) = C x(t) + D u(t-1) + d: the effect of the previous input on the output is still there when the next
+    input is computed from it. Adds only as many states as D has rank. Returns a plant without D unchanged.
     """
     U, sizes, V = np.linalg.svd(plant.D)
     rank = int((sizes > 1e-12 * max(sizes[0], np.finfo(float).tiny)).sum()) if np.any(plant.D) else 0
@@ -188,8 +190,8 @@ def strictly_proper(plant: Plant) -> Plant:
 
 
 def at_disturbances(plant: Plant, inputs: int, level: np.ndarray) -> Plant:
-    """The plant of the first `inputs` columns of u, the others held at `level`: what a controller meets that
-    is not told the disturbances."""
+    """Returns the plant of the first `inputs` columns of u, with the others constant at `level`. This is the
+    plant for a controller that does not get the disturbances."""
     return plant._replace(
         B=plant.B[:, :inputs],
         D=plant.D[:, :inputs],
@@ -199,7 +201,8 @@ def at_disturbances(plant: Plant, inputs: int, level: np.ndarray) -> Plant:
 
 
 def padded(plants: Sequence[Plant]) -> list[Plant]:
-    """The plants with one order: states that nothing moves and nobody sees fill up the smaller ones."""
+    """Returns the plants with equal order. Smaller ones are filled up with states that nothing moves and no
+    output shows."""
     most = max(plant.n for plant in plants)
     return [
         plant._replace(
@@ -214,14 +217,14 @@ def padded(plants: Sequence[Plant]) -> list[Plant]:
 
 
 def hold_state(plant: Plant, x: np.ndarray) -> np.ndarray:
-    """The steady input u (m,) of least norm that holds the plant at state x (n,): (I - A) x = B u + b; the
-    nearest one where none is exact."""
+    """Returns the steady input u (m,) of least norm that holds the plant at state x (n,): (I - A) x = B u +
+    b. If none is exact, returns the nearest one."""
     return np.linalg.lstsq(plant.B, (np.eye(plant.n) - plant.A) @ x - plant.b, rcond=None)[0]
 
 
 def hold_output(plant: Plant, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Steady state x (n,) and input u (m,) of least norm in u with C x + d as near as
-    possible to y (p,), and x = A x + B u + b exactly."""
+    """Returns a steady state x (n,) and input u (m,) with C x + D u + d as near as possible to y (p,), and x
+    = A x + B u + b exactly. Among equally near ones u has the least norm."""
     n = plant.n
     balance = np.hstack([np.eye(n) - plant.A, -plant.B])
     free = scipy.linalg.null_space(balance)
@@ -237,7 +240,7 @@ def hold_output(plant: Plant, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stored(plants: Sequence[Plant]) -> dict[str, tuple[np.ndarray, str, str]]:
-    """Plants of one order as named arrays with unit and meaning, stacked along the first axis, for an
+    """Returns plants of one order as named arrays with unit and meaning, stacked along the first axis, for an
     artifact; `restored` reads them back."""
     meaning = {
         "A": ("1", "state matrix"),

@@ -1,5 +1,5 @@
-"""Probing signals: the study's (48)-(52), and practical ones within amplitude and rate limits; what they
-excite, said before anything is learned from them."""
+"""Probing signals: the study's (48)-(52), and practical ones within amplitude and rate limits. Also their
+excitation, which is checked before anything is learned from them."""
 
 from typing import NamedTuple
 
@@ -9,8 +9,8 @@ from pipeline.temperature.plant import Plant
 
 
 def multisine(rng: np.random.Generator, samples: int, inputs: int, *, amplitude: float) -> np.ndarray:
-    """(samples, inputs) within +-amplitude: equal power at every frequency of the record, random phases,
-    other lines for each input."""
+    """Returns a signal (samples, inputs) within +-amplitude, with equal power at every frequency of the
+    record and random phases. No two inputs share a frequency."""
     lines = np.arange(1, (samples + 1) // 2)
     spectrum = np.zeros((samples // 2 + 1, inputs), complex)
     for channel in range(inputs):
@@ -23,15 +23,15 @@ def multisine(rng: np.random.Generator, samples: int, inputs: int, *, amplitude:
 def prbs(
     rng: np.random.Generator, samples: int, inputs: int, *, amplitude: float, shortest: int
 ) -> np.ndarray:
-    """(samples, inputs) of +-amplitude: a random binary sequence that may switch every
-    `shortest` samples, each input at its own draws."""
+    """Returns a random binary sequence (samples, inputs) of +-amplitude that may switch every `shortest`
+    samples, independently for each input."""
     bits = rng.integers(0, 2, (-(-samples // shortest), inputs))
     return amplitude * (2.0 * np.repeat(bits, shortest, axis=0)[:samples] - 1.0)
 
 
 class Probe(NamedTuple):
-    """u (samples, m) as applied, y (samples, p) as measured, and the share of (sample,
-    input) at a limit of amplitude, rate or machine."""
+    """u (samples, m) as applied, y (samples, p) as measured, and the share of (sample, input) at a limit of
+    amplitude, rate or machine."""
 
     u: np.ndarray
     y: np.ndarray
@@ -47,12 +47,12 @@ def probe(
     feedback: np.ndarray,
     noise: np.ndarray,
 ) -> Probe:
-    """u = u_centre + feedback (y_centre - y measured) + signal, within the limits: outputs stay near
-    y_centre, from measurements only.
+    """Plays u = u_centre + feedback (y_centre - y measured) + signal on the plant, within the limits. Outputs
+    stay near y_centre, with feedback from measurements only.
 
     point: state x (n,) at the start, u_centre (m,) and y_centre (p,); limits: low (m,) <= u <= high (m,), and
-    at most so many percent a step; feedback (m, p) in percent per °C; noise (samples, p) in °C. What is
-    applied is what is recorded, so that limits bias nothing.
+    the largest change in percent per step; feedback (m, p) in percent per °C; noise (samples, p) in °C. The
+    applied inputs are recorded, so limits cause no bias.
     """
     (x, u_centre, y_centre), (low, high, rate) = point, limits
     last = u_centre
@@ -67,8 +67,9 @@ def probe(
 
 
 class Excitation(NamedTuple):
-    """Of u over windows of `order` samples: rank and condition of its second moment; r.m.s. level (bands, m)
-    in percent within equal bands from 0 to pi rad a step."""
+    """Excitation of u over windows of `order` samples: rank and condition number of its second moment
+    (`full`: the largest possible rank), and its r.m.s. level (bands, m) in percent within equal bands from 0
+    to pi rad a step."""
 
     order: int
     rank: int
@@ -78,8 +79,8 @@ class Excitation(NamedTuple):
 
 
 def excitation(u: np.ndarray, order: int, *, bands: int = 8) -> Excitation:
-    """Persistency of excitation of u (samples, m): of the order `order` where the rank is m x order. Raises
-    ValueError where the record is shorter than that asks."""
+    """Returns the excitation of u (samples, m). u is persistently exciting of order `order` if the rank is m
+    x order. Raises ValueError if there are fewer than (m + 1) order samples."""
     samples, m = u.shape
     if samples < (m + 1) * order:
         raise ValueError(

@@ -1,5 +1,5 @@
-"""Sections of the params files that several stages of the temperature loop read. A section of one stage
-stands in the file of that stage."""
+"""Sections of the params files that several stages of the temperature loop read. The section of a single
+stage is in the file of that stage."""
 
 import re
 from typing import Annotated, Literal
@@ -25,16 +25,15 @@ def _signal_name(name: str) -> str:
 
 
 class PlantSignal(Section):
-    """A signal of the machine; figures label their axes with its name and unit."""
+    """A signal of the machine. Figures label their axes with its name and unit."""
 
     name: Annotated[str, AfterValidator(_signal_name)]
     unit: str = Field(min_length=1, max_length=20)
 
 
 class Input(PlantSignal):
-    """A heater or the motor; low and high are the limits of what the machine can give, in percent, and
-    rate_percent_per_s how fast it may change; none: as fast as it is asked. `heats`: no output can fall for
-    good when it is raised."""
+    """A heater or the motor. low and high are the limits of the machine in percent; rate_percent_per_s is how
+    fast it may change (none: no limit). `heats`: raising it cannot lower any output in the steady state."""
 
     low: float = Field(ge=-100, le=100)
     high: float = Field(ge=-100, le=100)
@@ -49,8 +48,8 @@ class Input(PlantSignal):
 
 
 class Output(PlantSignal):
-    """A barrel temperature, the reference that it should settle at, and between which temperatures the
-    machine must stay, in °C; a simulated machine needs no limits."""
+    """A barrel temperature: its reference, and low and high, the temperatures between which the machine must
+    stay, in °C. A simulated machine needs no limits."""
 
     reference: float = Field(ge=-273.15, le=1000)
     low: float | None = Field(default=None, ge=-273.15, le=2000)
@@ -70,7 +69,7 @@ class Output(PlantSignal):
 
 class Plant(Section):
     """Section `plant`: the machine's signals and its sample time. `disturbances` are recorded signals that
-    act on the outputs and that no controller moves: fan, feed, a sensor of the room."""
+    act on the outputs but that no controller sets: fan, feed, a sensor of the room."""
 
     inputs: list[Input] = Field(min_length=1, max_length=32)
     disturbances: list[PlantSignal] = Field(default=[], max_length=16)
@@ -89,13 +88,14 @@ class Plant(Section):
 
     @property
     def acting(self) -> list[PlantSignal]:
-        """What acts on the outputs: inputs, then disturbances."""
+        """The signals that act on the outputs: inputs, then disturbances."""
         return [*self.inputs, *self.disturbances]
 
 
 def recorded(machine: Plant, record: str) -> Plant:
-    """The machine without the zones that ingest left out of the table `record`: what controllers are designed
-    and judged for. If the table is missing or of another machine, the machine as declared."""
+    """Returns the machine without the zones that ingest left out of the table `record`. Controllers are
+    designed and judged for this machine. If the table is missing or belongs to another machine, returns the
+    machine as declared."""
     names = artifacts.column_names(record)
     sides = {
         side: [signal for signal in getattr(machine, side) if signal.name in names]
@@ -105,8 +105,8 @@ def recorded(machine: Plant, record: str) -> Plant:
 
 
 def check_output_limits(machine: Plant, source: str) -> None:
-    """Raises ValueError where recordings are the source and an output has no limits: nobody else knows how
-    hot the machine may get."""
+    """Raises ValueError if the source is recordings and an output has no limits, because only the owner knows
+    how hot the machine may get."""
     lacking = [output.name for output in machine.outputs if output.low is None or output.high is None]
     if source == "recordings" and lacking:
         raise ValueError(
@@ -117,8 +117,8 @@ def check_output_limits(machine: Plant, source: str) -> None:
 
 
 class Tracking(Section):
-    """Section `tracking`: what every controller and every comparison shares; Q = yardstick_q I and R =
-    yardstick_r I are the weights of the common yardstick."""
+    """Section `tracking`: what every controller and every comparison shares. Q = yardstick_q I and R =
+    yardstick_r I are the weights of the common cost."""
 
     gamma: float = Field(gt=0, le=1)
     yardstick_q: float = Field(gt=0, le=1e6)
@@ -133,10 +133,10 @@ Offsets = Annotated[list[Annotated[float, Field(ge=-500, le=500)]], Field(max_le
 
 
 class Half(Section):
-    """One half of the panel: how many plants are drawn and from which seed, how long a case is as a share of
-    panel.steps, how much of the declared spread the plants have, temperatures that they are held
-    at, and references as offsets from plant.outputs: constant ones, a sequence, a ramp that ends at the
-    reference, and a sinusoid about it."""
+    """One half of the panel: number of plants and their seed; `length` of a case as a share of panel.steps;
+    `spread` of the plants as a share of the declared spread; temperatures at which they start; and references
+    as offsets from plant.outputs: constant ones, a sequence, a ramp that ends at the reference, and a
+    sinusoid about it."""
 
     seed: int = Field(ge=0, le=2**31)
     plants: int = Field(ge=2, le=100_000)
@@ -151,10 +151,10 @@ class Half(Section):
 
 
 class Panel(Section):
-    """Section `panel`: the plants and cases on which controllers are compared; nothing is learned or tuned on
-    the judging half. Plants lie around the machine: input gains 1 +- input_gain each, its speed divided by 1
-    +- slower, up to extra_heat_loss_per_step more heat lost, a share `delayed` of them with inputs a sample
-    late, the ambient +- ambient_degC."""
+    """Section `panel`: the plants and cases on which controllers are compared; the judging half is not used
+    for learning or tuning. Plants vary around the machine: input gains 1 +- input_gain each, its speed
+    divided by 1 +- slower, up to extra_heat_loss_per_step more heat loss, a share `delayed` of them with
+    inputs one sample late, the ambient +- ambient_degC."""
 
     noise_degC: float = Field(ge=0, le=50)
     input_gain: float = Field(gt=0, lt=1)
@@ -184,8 +184,8 @@ class Panel(Section):
 
 
 class GenerateProbing(Section):
-    """Section `generate_probing`: how the study's machine is probed, and what is asked of the next
-    experiment. `doubt_...` is what the identified family does not hold."""
+    """Section `generate_probing`: how the study's machine is probed, and what the next experiment must do.
+    `doubt_...` is the uncertainty that the identified family does not cover."""
 
     source: Literal["simulated", "recordings"]
     seed: int = Field(ge=0, le=2**31)
@@ -207,8 +207,8 @@ class GenerateProbing(Section):
 
 
 def given_centre(settings: GenerateProbing, machine: Plant) -> list[float] | None:
-    """The operating point (m,) that the user gives, one number for all inputs or one each; None if it is left
-    to the model."""
+    """Returns the operating point (m,) that the user gives, as one number for all inputs or one each. Returns
+    None if it is left to the model. Raises ValueError for another number of values."""
     given, count = settings.centre_percent, len(machine.inputs)
     if given is None:
         return None
@@ -239,9 +239,9 @@ class TuneWeights(Section):
 
 
 class TemperatureRules(Section, extra="ignore"):
-    """Of section `report` the limits that a simulation of the temperature loop can check; settling_s null: as
-    panel.settling_s says on the study's machine, as the record says on another; heating_s null: that and the
-    shortest time from cold."""
+    """The limits of section `report` that a simulation of the temperature loop can check. settling_s null:
+    panel.settling_s on the study's machine, a limit from the record on another. heating_s null: the settling
+    limit plus the shortest time from cold."""
 
     settled_error_degC: float = Field(gt=0, le=1000)
     peak_error_degC: float = Field(gt=0, le=1000)

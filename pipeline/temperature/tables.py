@@ -1,6 +1,6 @@
 """Every table that a stage writes: columns with type, unit, meaning and range, and a version.
 
-Other columns are another version: raise the number with them.
+If the columns change, raise the version.
 """
 
 from collections.abc import Sequence
@@ -10,8 +10,8 @@ from pipeline.temperature.settings import PlantSignal
 
 
 def record(inputs: Sequence[PlantSignal], outputs: Sequence[PlantSignal]) -> Schema:
-    """The table that ingest writes: one row a sample. A masked value stays as
-    recorded; the flag beside it says not to use it."""
+    """Returns the schema of the table that ingest writes: one row per sample. A masked value stays as
+    recorded; the flag beside it marks it as not usable."""
     faulty = "is not to be used here: missing, or found faulty"
     columns = [
         Column("recording", TEXT, NONE, "file below datasets/raw that the sample is from"),
@@ -31,8 +31,9 @@ def record(inputs: Sequence[PlantSignal], outputs: Sequence[PlantSignal]) -> Sch
 
 
 def set_points(outputs: Sequence[PlantSignal]) -> Schema:
-    """The table that ingest writes beside the record, row by row, if the mapping has a set-point: what each
-    output was to be, as recorded; NaN before the first value, and if it was not recorded."""
+    """Returns the schema of the table that ingest writes beside the record, row by row, if the mapping has
+    a set-point: the recorded set-point of each output. NaN before the first value, and if it was not
+    recorded."""
     columns = [
         Column(set_point_of(signal.name), FLOAT, signal.unit, f"set-point of {signal.name}", nullable=True)
         for signal in outputs
@@ -41,7 +42,7 @@ def set_points(outputs: Sequence[PlantSignal]) -> Schema:
 
 
 def set_point_of(output: str) -> str:
-    """The column of an output's set-point."""
+    """Returns the column name of an output's set-point."""
     return f"{output}_set_point"
 
 
@@ -66,8 +67,8 @@ QUALITY = Schema(
 
 
 def trajectories(inputs: Sequence[PlantSignal], outputs: Sequence[PlantSignal]) -> Schema:
-    """Two cases of the comparison under every contestant, as deployed: true outputs with their references,
-    commands, and the inputs that the machine was given."""
+    """Returns the schema of two cases of the comparison under every controller, as deployed: true outputs
+    with their references, commands, and applied inputs."""
     columns = [
         Column("contestant", TEXT, NONE, "which contestant"),
         Column(
@@ -88,7 +89,7 @@ def trajectories(inputs: Sequence[PlantSignal], outputs: Sequence[PlantSignal]) 
     return Schema("trajectories", 3, tuple(columns))
 
 
-# every case that every contestant ran, as deployed, on true outputs
+# every case of every controller, as deployed, on true outputs
 CASES = Schema(
     "cases",
     1,
@@ -198,8 +199,8 @@ ORDER = Schema(
 
 
 def holdout(outputs: Sequence[PlantSignal]) -> Schema:
-    """The part of the record that judged the model: measured, simulated from its inputs alone, and predicted
-    from outputs so many steps before."""
+    """Returns the schema of the part of the record that judged the model: measured, simulated from its inputs
+    alone, and predicted from outputs identify_plant.ahead_steps samples before."""
     kinds = {
         "measured": "as recorded",
         "simulated": "by the model, from the inputs alone",

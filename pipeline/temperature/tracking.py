@@ -10,8 +10,8 @@ from pipeline.temperature.controllers.law import Law, Plant
 
 
 class Gains(NamedTuple):
-    """u = -K_x x - K_r r - k minimises (3); P (n, n) is the quadratic
-    part of the value. K_x (m, n), K_r (m, p), k (m,)."""
+    """The gains for which u = -K_x x - K_r r - k minimises (3). K_x (m, n), K_r (m, p), k (m,); P (n, n) is
+    the quadratic part of the value."""
 
     K_x: np.ndarray
     K_r: np.ndarray
@@ -28,12 +28,14 @@ def riccati(
     tolerance: float = 1e-14,
     max_doublings: int = 60,
 ) -> np.ndarray:
-    """P = Q + A'PA - A'PB (R + B'PB)^-1 B'PA
+    """Returns the stabilising solution P (n, n) of
+
+    P = Q + A'PA - A'PB (R + B'PB)^-1 B'PA
 
     by structure-preserving doubling (Chu, Fan, Lin, Wang 2004): each step doubles the horizon.
 
-    A (n, n), B (n, m), Q (n, n) and R (m, m) symmetric, R > 0. Raises ValueError where the recursion does not
-    settle: (A, B) is not stabilisable.
+    A (n, n), B (n, m), Q (n, n) and R (m, m) symmetric, R > 0. Raises ValueError if the recursion does not
+    converge: (A, B) is then not stabilisable.
     """
     G = B @ np.linalg.solve(R, B.T)
     P, identity = Q, np.eye(len(A))
@@ -55,13 +57,15 @@ def riccati(
 
 
 def gains(plant: Plant, Q: np.ndarray, R: np.ndarray, gamma: float) -> Gains:
-    """The optimal u = -K_x x - K_r r - k for (3) with r constant: discrete Riccati equation on sqrt(gamma)
-    (A, B).
+    """Returns the optimal u = -K_x x - K_r r - k for (3) with constant r, from the discrete Riccati equation
+    of sqrt(gamma) A and sqrt(gamma) B.
 
     With w = [r; 1], x+ = A x + B u + E w and y - r = C x + G w:
 
     K_w = S^-1 gamma B'(P E + P_xw)
     P_xw = C'QG + gamma (A - B K_x)'(P E + P_xw)
+
+    Here S = R + gamma B'P B. Raises ValueError if the plant has feed-through (D not zero).
     """
     _strictly_proper(plant)
     p = plant.p
@@ -76,7 +80,7 @@ def gains(plant: Plant, Q: np.ndarray, R: np.ndarray, gamma: float) -> Gains:
 
 
 def still_law(m: int, p: int) -> Law:
-    """A law that asks for nothing and remembers nothing: what doing nothing is judged as."""
+    """Returns a law without memory whose command is always zero. It stands for no control."""
     none = np.zeros((0, 0))
     return Law(
         A=none,
@@ -100,22 +104,25 @@ def observer_gain(plant: Plant, tau: float) -> np.ndarray:
 
 
 def robust_observer_gain(plant: Plant, tau: float) -> np.ndarray:
-    """L = A P C'(C P C' + tau I)^-1
+    """Returns the observer gain (n, p)
 
-    with P of the dual Riccati equation for process noise B B': stable for every tau > 0, and the same in any
-    coordinates.
+    L = A P C'(C P C' + tau I)^-1
 
-    The Kalman gain of a record trusts its model wherever it goes. What a model gets wrong on another day acts
-    like its inputs (their gain, heat lost), so that it is those directions that the observer follows; tau in
-    °C^2 per percent^2 says how much noisier than that the sensors are.
+    with P of the dual Riccati equation for process noise B B'. The observer is stable for every tau > 0, and
+    the same in any coordinates.
+
+    The Kalman gain of a record trusts its model in every direction. Errors of the model on another day act
+    like its inputs (their gain, heat lost), so this observer follows those directions. tau, in °C^2 per
+    percent^2, says how much noisier than that the sensors are.
     """
     P = riccati(plant.A.T, plant.C.T, plant.B @ plant.B.T, tau * np.eye(plant.p))
     return plant.A @ P @ plant.C.T @ np.linalg.inv(plant.C @ P @ plant.C.T + tau * np.eye(plant.p))
 
 
 def observer_law(plant: Plant, gains: Gains, L: np.ndarray, *, integral: float = 0.0) -> Law:
-    """Observer (6) and gains as one law: z = x-hat, started from the first measurement at pinv(C) (y(0) - d),
-    which costs nothing and saves 4.8 % of J."""
+    """Returns observer (6) and gains as one law. Its memory z = x-hat starts from the first measurement at
+    pinv(C) (y(0) - d), which costs nothing and lowers J by 4.8 %. `L` (n, p): observer gain; `integral`:
+    share of the error that the integrator adds per step. Raises ValueError if the plant has feed-through."""
     n, m, p = plant.n, plant.m, plant.p
     _strictly_proper(plant)
     C_inverse = np.linalg.pinv(plant.C)
@@ -139,36 +146,38 @@ def observer_law(plant: Plant, gains: Gains, L: np.ndarray, *, integral: float =
 def model_based(
     plant: Plant, q: np.ndarray, r: np.ndarray, integral: float, *, gamma: float, tau: float
 ) -> Law:
-    """Riccati gains of an identified model without feed-through for weights diag(q), diag(r), and an observer
-    that stands its errors (robust_observer_gain), started where inputs may have brought it. `integral` is the
-    outer integrator's share of the error a step."""
+    """Returns Riccati gains and an observer that tolerates model errors (robust_observer_gain), for an
+    identified model without feed-through and weights diag(q), diag(r). The observer starts at a state that
+    inputs may have reached. `integral`: share of the error that the outer integrator adds per step."""
     best, L = gains(plant, np.diag(q), np.diag(r), gamma), robust_observer_gain(plant, tau)
     return started_reached(observer_law(plant, best, L, integral=integral), plant)
 
 
 def started_reached(law: Law, plant: Plant, *, forgets: float = 0.01) -> Law:
-    """`observer_law` started at the likeliest state that shows y(0), for a plant that inputs have moved:
-    x = W C'(C W C')^-1 (y(0) - d), W the Gramian of what inputs of equal power reach, older ones forgotten.
+    """Returns `observer_law`, started at the likeliest state with output y(0) of a plant that inputs have
+    moved: x = W C'(C W C')^-1 (y(0) - d). W is the Gramian of the states that inputs of equal power reach,
+    with older inputs forgotten.
 
-    pinv(C) (y(0) - d) depends on the coordinates of the model: in those of a refined one it doubled J of the
-    study. This one is the same in any coordinates. A start that trusts the hold, x = A x + B u0 + b, has a
-    third of the gap to the optimum on the study's plant, and five times the worst settling over the training
-    panel, where input gains and heat loss differ (measured).
+    The start pinv(C) (y(0) - d) depends on the coordinates of the model. In those of a refined model it
+    doubled J of the study. This start is the same in any coordinates. Measured alternative: a start that
+    trusts the hold, x = A x + B u0 + b. On the study's plant its gap to the optimum is a third as large, but
+    over the training panel, where input gains and heat loss differ, its worst settling time is five times as
+    long.
     """
     inverse = reached_state(plant, forgets=forgets)
     return law._replace(start_y=inverse, start=-inverse @ plant.d)
 
 
 def reached_state(plant: Plant, *, forgets: float = 0.01) -> np.ndarray:
-    """W C'(C W C')^-1 (n, p) of `started_reached`."""
+    """Returns W C'(C W C')^-1 (n, p) of `started_reached`."""
     radius = max(1.0, np.abs(np.linalg.eigvals(plant.A)).max())
     W = scipy.linalg.solve_discrete_lyapunov((1 - forgets) / radius * plant.A, plant.B @ plant.B.T)
     return W @ plant.C.T @ np.linalg.pinv(plant.C @ W @ plant.C.T, hermitian=True)
 
 
 def aimed(law: Law, r: np.ndarray, u: np.ndarray, y: np.ndarray) -> Law:
-    """The law with its feed-forward replaced so that it rests at input u and output y while
-    the reference is r: u - K (z - z_rest) - K_r xi."""
+    """Returns the law with its feed-forward replaced, so that it rests at input u and output y while the
+    reference is r: u - K (z - z_rest) - K_r xi."""
     z = np.linalg.solve(np.eye(len(law.A)) - law.A, law.B_u @ u + law.B_y @ y + law.B_r @ r + law.c)
     return law._replace(k=-u - law.K @ z - law.D @ y - law.K_r @ r)
 

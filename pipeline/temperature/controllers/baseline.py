@@ -1,11 +1,11 @@
-"""The simple rule that every learned controller must beat: one PI controller a zone, tuned by SIMC from the
+"""The baseline that every learned controller must beat: one PI controller per zone, tuned by SIMC from the
 model's step response (Skogestad 2003).
 
-It gets the care that our own laws get: the feasible target of the model as feed-forward, an integrator that
-the way up does not wind up, one input a zone.
+It gets the same care as the other controllers: the feasible target of the model as feed-forward, an
+integrator that does not wind up while heating up, and one input per zone.
 
-A step response is read where it has risen, not at its first samples: those of a model identified from a
-record are ripple. From them a two-heater kit got gains of the wrong sign on both loops.
+A step response is read where it has risen, not at its first samples, because in a model identified from a
+record those are ripple. Read from them, both loops of a two-heater kit got gains of the wrong sign.
 """
 
 from collections.abc import Sequence
@@ -17,22 +17,21 @@ import scipy.optimize
 from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
 from pipeline.temperature.tracking import Law
 
-RISEN = 0.8  # of the largest excursion: up to there a response is fitted; later a slow tail would be tau
-LEVEL = 0.9  # of the band over a family that may not hold zero where a sign is certain
+RISEN = 0.8  # of the largest excursion: a response is fitted up to there; beyond, a slow tail would set tau
+LEVEL = 0.9  # level of the band over a family: a sign is certain if the band excludes zero
 WEAKEST = 1e-9  # of the strongest effect: below it an input does not move an output
-NOISE_SHARE = (
-    0.03  # of an input's range: 3 percent of duty a standard deviation wears no relay and heats nothing
-)
-MOST_POINTS = 150  # of a response in one fit
-LONGEST_TAU = 5.0  # times the stretch that is fitted: beyond it a straight line stands for every tau
+# of an input's range: a standard deviation of 3 percent of duty neither wears a relay nor adds heat
+NOISE_SHARE = 0.03
+MOST_POINTS = 150  # largest number of points of a response in one fit
+LONGEST_TAU = 5.0  # times the fitted stretch: for any longer tau a straight line is used
 
 
 class Pairing(NamedTuple):
-    """Input of each output (p,), and SIMC's gain in percent per °C and reset time in samples of each pair
-    (p,); inputs in no pair rest at their target.
+    """Input of each output (p,), with SIMC's gain in percent per °C and reset time in samples of each pair
+    (p,). Inputs in no pair stay at their target.
 
-    slope in °C per percent and sample, time_constant (infinite where the response is a ramp) and delay in
-    samples, each (p,): the first-order model of each pair that the settings come from.
+    `slope` in °C per percent and sample, `time_constant` (infinite if the response is a ramp) and `delay` in
+    samples, each (p,): the first-order models from which the settings are computed.
     """
 
     inputs: np.ndarray
@@ -44,8 +43,8 @@ class Pairing(NamedTuple):
 
 
 class Rise(NamedTuple):
-    """slope tau (1 - exp(-(t - delay) / tau)), the model of one step response; samples, `until` the one up
-    to which it was fitted."""
+    """The model slope tau (1 - exp(-(t - delay) / tau)) of one step response, with times in samples. `until`
+    is the last sample that was fitted."""
 
     slope: float
     time_constant: float
@@ -64,21 +63,23 @@ def pairing(
     gain_factor: float | np.ndarray = 1.0,
     reset_factor: float | np.ndarray = 1.0,
 ) -> Pairing:
-    """Pairs whose full ranges heat fastest (the largest product of slopes, which no unit changes), one input
-    an output, and SIMC on k = slope tau, tau and theta of each pair's step response:
+    """Pairs each output with the input that heats it, and tunes each pair by SIMC. The pairs are those whose
+    full input ranges heat fastest: the product of their slopes is the largest, whatever the units. With k =
+    slope tau, tau and theta of each pair's step response,
 
     K_c = tau / (k (tau_c + theta))
     T_i = min(tau, 4 (tau_c + theta))
     tau_c = max(theta, one sample)
 
-    (Skogestad 2003, table 1). A held input is late by half a sample, which theta counts; it is no less than
-    one. A search may multiply K_c and T_i, by one number or one an output (p,). tau_c is longer where a
-    standard deviation of the sensor's noise (p,) would otherwise move the input by more than `NOISE_SHARE` of
-    its range: so quick a loop is no longer what the record shows.
+    (Skogestad 2003, table 1). A held input is late by half a sample, which theta includes; theta is at least
+    one sample. A search may multiply K_c and T_i by `gain_factor` and `reset_factor`, each one number or one
+    per output (p,). tau_c is longer if a standard deviation of the sensor noise (p,) would otherwise move the
+    input by more than `NOISE_SHARE` of its range, because the record does not support so fast a loop.
 
-    A pair counts where its sign is certain: its response goes one way, and the band of the rise over `family`
-    does not hold zero. Modes slower than 2 `horizon` samples count as integrators. Raises ValueError where
-    an output has no such input of its own.
+    A pair counts only if its sign is certain: its response goes one way, and the band of the rise over
+    `family` does not include zero. Modes slower than 2 `horizon` samples count as integrators. `low`, `high`
+    (m,): limits of the inputs in percent. Raises ValueError if there are fewer inputs than outputs, or an
+    output has no such input of its own.
     """
     if plant.m < plant.p:
         raise ValueError(f"PI needs an input for each of the {plant.p} outputs; found {plant.m} inputs")
@@ -87,7 +88,7 @@ def pairing(
     stretch = _stretch(plant, horizon)[0]
     responses, *others = (_responses(member, stretch) for member in (plant, *family))
     inputs = _assigned(np.abs(slope) * (high - low), _certain(responses, fitted, others))
-    # the gain in percent per °C at which noise moves the input by its share: the inverse may be zero
+    # inverse of the gain in percent per °C at which noise moves the input by its share; it may be zero
     noise = np.zeros(plant.p) if noise_degC is None else noise_degC
     per_gain = noise / (NOISE_SHARE * (high - low)[inputs])
     return _settings(
@@ -96,14 +97,14 @@ def pairing(
 
 
 def rises(plant: Plant, horizon: int) -> list[list[Rise]]:
-    """The rise of each output (p lists) at a step of each input (m each), of a slope of its sign; `horizon`
-    as in `pairing`."""
+    """Returns the rise of each output (p lists) after a step of each input (m each); the slope has the sign
+    of the response. `horizon` as in `pairing`."""
     stretch, decayed = _stretch(plant, horizon)
     responses = _responses(plant, stretch)
     direction = _direction(responses, decayed)
     if decayed and stretch > horizon:
-        # beyond `horizon` an identified slow mode may turn an answer round: where it turns that of an
-        # output's strongest input, responses are followed as of an integrator
+        # beyond `horizon` an identified slow mode may reverse a response: if it reverses that of an
+        # output's strongest input, responses are followed as for an integrator
         early = _responses(plant, _tenth(horizon))
         strongest = np.abs(early[-1]).argmax(axis=1)
         first, outputs = _direction(early, False), np.arange(plant.p)
@@ -116,17 +117,18 @@ def rises(plant: Plant, horizon: int) -> list[list[Rise]]:
 
 
 def _responses(plant: Plant, horizon: int) -> np.ndarray:
-    """Step responses (horizon + 1, p, m) from rest, zero at the sample of the step."""
+    """Returns step responses (horizon + 1, p, m) from rest, zero at the sample of the step."""
     rise = np.cumsum(markov_parameters(strictly_proper(plant), horizon), axis=0)
     return np.concatenate([np.zeros((1, *rise.shape[1:])), rise])
 
 
 def _stretch(plant: Plant, horizon: int) -> tuple[int, bool]:
-    """Samples over which responses are followed, and whether every mode has decayed by then: three time
-    constants of the slowest.
+    """Returns the number of samples over which responses are followed, and whether every mode has decayed by
+    then. It is three time constants of the slowest mode.
 
-    A mode twice as slow as `horizon` is an integrator to it, and has no end to look at: a tenth is followed,
-    so that the slope is that of the rise and not of what neighbours do much later (as `trust.horizon` does).
+    A mode more than twice as slow as `horizon` looks like an integrator, whose response has no end. Only a
+    tenth of the horizon is then followed, so that the slope is that of the rise and not of what neighbours do
+    much later (as in `trust.horizon`).
     """
     radius = np.abs(np.linalg.eigvals(strictly_proper(plant).A)).max()
     slowest = -1 / np.log(np.clip(radius, 1e-6, 1 - 1e-12)) if radius < 1 else np.inf
@@ -140,15 +142,15 @@ def _tenth(horizon: int) -> int:
 
 
 def _direction(responses: np.ndarray, decayed: bool) -> np.ndarray:
-    """The way (p, m) that each output goes: in the end where modes have `decayed`; otherwise the way of its
-    largest excursion, as an end there is none. A first answer the other way counts as dead time."""
+    """Returns the direction (p, m) of each output: that of its final value if all modes have `decayed`,
+    otherwise that of its largest excursion. A first response in the other direction counts as dead time."""
     largest = np.take_along_axis(responses, np.abs(responses).argmax(axis=0)[None], axis=0)[0]
     return np.where((responses[-1] if decayed else largest) < 0, -1.0, 1.0)
 
 
 def _rise(forward: np.ndarray, sign: float) -> Rise:
-    """The model of one response (horizon + 1,) that goes upward, fitted in least squares to where it first
-    reaches RISEN of its peak; `sign` turns the slope back."""
+    """Fits the model of one upward response (horizon + 1,) by least squares, up to where it first reaches
+    RISEN of its peak. `sign` restores the sign of the slope."""
     peak = int(forward.argmax())
     if not forward[peak] > 0:
         return Rise(0.0, np.inf, 0.0, len(forward) - 1)
@@ -168,14 +170,15 @@ def _rise(forward: np.ndarray, sign: float) -> Rise:
 
 
 def _shapes(t: np.ndarray, tau: np.ndarray, delay: np.ndarray) -> np.ndarray:
-    """tau (1 - exp(-(t - delay) / tau)) of slope one (T, k); a ramp where tau is infinite."""
+    """Returns tau (1 - exp(-(t - delay) / tau)), of slope one, (T, k); a ramp if tau is infinite."""
     late = np.maximum(t[:, None] - delay, 0.0)
     bounded = np.where(np.isfinite(tau), tau, 1.0)
     return np.where(np.isfinite(tau), -bounded * np.expm1(-late / bounded), late)
 
 
 def _nearest(t, target, taus, delays) -> tuple[float, float]:
-    """tau and delay of the grid nearest in least squares, the slope free and not negative."""
+    """Returns tau and delay of the grid point nearest in least squares; the slope is free but not
+    negative."""
     delay, tau = (part.ravel() for part in np.meshgrid(delays, taus, indexing="ij"))
     shapes = _shapes(t, tau, delay)
     products = np.maximum(target @ shapes, 0.0)
@@ -184,8 +187,8 @@ def _nearest(t, target, taus, delays) -> tuple[float, float]:
 
 
 def _certain(responses: np.ndarray, fitted: list[list[Rise]], others: list[np.ndarray]) -> np.ndarray:
-    """Whether the sign of each pair (p, m) is certain: its excursions the other way are smaller than the
-    response itself, and the mean of the rise has one sign over LEVEL of the family."""
+    """Returns whether the sign of each pair (p, m) is certain: its excursions in the other direction are
+    smaller than the response itself, and the mean of the rise has the same sign over LEVEL of the family."""
     certain = np.zeros(responses.shape[1:], bool)
     for (o, i), _ in np.ndenumerate(certain):
         rise, forward = fitted[o][i], responses[:, o, i] * np.sign(fitted[o][i].slope)
@@ -197,11 +200,11 @@ def _certain(responses: np.ndarray, fitted: list[list[Rise]], others: list[np.nd
 
 
 def _assigned(effect: np.ndarray, certain: np.ndarray) -> np.ndarray:
-    """Input of each output (p,) with the largest product of effects (p, m). Raises ValueError where some
-    output is left without a certain one."""
+    """Returns the input of each output (p,) with the largest product of effects (p, m). Raises ValueError if
+    an output has no certain input left."""
     moves = effect > WEAKEST * effect.max()
     allowed = moves & certain
-    # one that is not allowed costs more than all that are could save
+    # a forbidden pair costs more than all allowed pairs together could save
     cost = -np.log(np.where(allowed, effect, 1.0))
     worst = (np.ptp(cost[allowed]) + 1.0) * len(effect) if allowed.any() else 1.0
     inputs = scipy.optimize.linear_sum_assignment(np.where(allowed, cost, cost.max() + worst))[1]
@@ -225,7 +228,8 @@ def _settings(
     gain_factor: float | np.ndarray,
     reset_factor: float | np.ndarray,
 ) -> Pairing:
-    """SIMC on each pair, with tau_c so long that no gain in percent per °C is above 1 / `per_gain` (p,)."""
+    """Tunes each pair by SIMC, with tau_c so long that no gain in percent per °C exceeds 1 / `per_gain`
+    (p,)."""
     slope, tau, delay = (
         np.array([getattr(rise, name) for rise in fitted]) for name in ("slope", "time_constant", "delay")
     )
@@ -237,8 +241,13 @@ def _settings(
 
 
 def pi_law(pairs: Pairing, *, inputs: int) -> Law:
-    """u = u_target + K_c (r + xi - y) on each pair
-    xi(t+1) = xi + (r - y) / T_i with each zone's own T_i; no other memory."""
+    """Returns the PI controllers of all pairs as one law:
+
+    u = u_target + K_c (r + xi - y)
+    xi(t+1) = xi + (r - y) / T_i
+
+    Each zone has its own T_i, and there is no other memory. `inputs`: number of inputs of the plant.
+    """
     p = len(pairs.inputs)
     to_input = np.zeros((inputs, p))
     to_input[pairs.inputs, np.arange(p)] = pairs.gain

@@ -1,4 +1,4 @@
-"""How each controller of the house is designed from a problem, at the values of its search."""
+"""Functions that design each built-in controller from a problem, with the values of its search."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -56,14 +56,14 @@ def varx_riccati(problem: DesignProblem, values: Mapping[str, float]) -> Design:
 
 
 def learned_kernel(problem: DesignProblem, values: Mapping[str, float]) -> Design:
-    """Its steady inputs come from the window that was learned from the same record."""
+    """Designs the learned kernel. Its steady inputs come from the window model of the same record."""
     if problem.kernel is None:
         raise ValueError(problem.undetermined.get("learned_kernel", UNDETERMINED))
     return _of_window(problem, values, partial(kernel.law, problem.kernel), problem.kernel.N)
 
 
 def predictive_control(problem: DesignProblem, values: Mapping[str, float]) -> Design:
-    """Its steady inputs come from the window, as those of the learned kernel."""
+    """Designs predictive control. Its steady inputs come from the window model, as for the learned kernel."""
     if problem.trajectories is None:
         raise ValueError(problem.undetermined.get("predictive_control", UNDETERMINED))
     return _of_window(problem, values, partial(predictive.law, problem.trajectories), problem.trajectories.N)
@@ -72,7 +72,7 @@ def predictive_control(problem: DesignProblem, values: Mapping[str, float]) -> D
 def _of_window(
     problem: DesignProblem, values: Mapping[str, float], law: Callable[..., Law], N: int
 ) -> Design:
-    """The design of law(Q, R, gamma, integral=...) on a window of N samples."""
+    """Returns the design of law(Q, R, gamma, integral=...) on a window of N samples."""
     (q, r), (ones_q, ones_r, _) = weights(problem, values), unit_weights(problem)
     made = law(np.diag(q), np.diag(r), problem.gamma, integral=values["integral"])
     model, _ = window.observer_form(problem.window, problem.plant.sample_time_s)
@@ -80,7 +80,8 @@ def _of_window(
 
 
 def exact_model(problem: DesignProblem, values: Mapping[str, float]) -> Design | None:
-    """Told the true plant; without integrator the paper's controller: Riccati gains and the observer (8)."""
+    """Designs the controller from the true plant. Without integrator it is the paper's controller: Riccati
+    gains and the observer (8)."""
     if problem.truth is None:
         return None
     plant, gamma = strictly_proper(problem.truth), problem.gamma

@@ -1,14 +1,14 @@
-"""What disturbances that are measured do to the outputs, learned from the record: a part fan, a filament's
-feed, the speed of a screw, a sensor of the room. Every controller is learned without them and is told them
-alike: inputs F (d - mean d) make up for what they do at rest.
+"""Learns from the record the effect of measured disturbances on the outputs: a part fan, a filament's feed,
+the speed of a screw, a sensor of the room. Every controller is learned without them and gets the same
+feed-forward: inputs F (d - mean d), which compensate their steady effect.
 
-A window model of the record, which is told inputs and disturbances, says both,
+A window model of the record with inputs and disturbances gives both effects,
 
     y(t) = G_u u + G_d d + ...,    F = -pinv(G_u(1)) G_d(1),
 
-with G(1) the steady gains. An input acts later than what it makes up for: cold filament is in the block at
-once, a heater's power only after the cartridge. So a change of d adds a kick to F d (law.FeedForward), as
-large as leaves the least error of the outputs over the AHEAD samples after a step of d.
+with G(1) the steady gains. An input acts later than the disturbance: cold filament is in the block at once,
+but a heater's power arrives only through the cartridge. So a change of d adds a kick to F d
+(law.FeedForward). Its size gives the least error of the outputs over the AHEAD samples after a step of d.
 """
 
 from collections.abc import Sequence
@@ -20,17 +20,17 @@ from pipeline.temperature.controllers import window
 from pipeline.temperature.controllers.law import FADES, FeedForward
 from pipeline.temperature.plant import Plant, plant, simulate
 
-LONGEST, ENOUGH = 24, 20  # samples of the window, and for each of its columns
-BLOCKS = 8  # left out one by one: how sure a gain is
-DETERMINED = 2.0  # deviations from zero of a gain that is fed forward
+LONGEST, ENOUGH = 24, 20  # longest window in samples, and samples required for each of its columns
+BLOCKS = 8  # of the record, left out one by one to find the deviation of a gain
+DETERMINED = 2.0  # deviations: a smaller gain is not fed forward
 AHEAD, LONGEST_LEAD = 60, 10.0  # samples
 OWN = 0.005  # share of a disturbance's variance that inputs and other disturbances do not explain
 
 
 class Told(NamedTuple):
-    """Disturbances d (q,): `effect` moves the outputs, from d less its `mean`, in °C; `high` is the level
-    above which a twentieth of the record lies; `gain` F (m, q) in percent a unit, and its `deviation`;
-    `lead` (q,) in samples."""
+    """The learned disturbances d (q,). `effect`: plant from d less its `mean` to the outputs in °C; `high`:
+    the level that d exceeds in a twentieth of the record; `gain`: F (m, q) in percent per unit; `deviation`:
+    standard deviation of the gain; `lead` (q,) in samples."""
 
     effect: Plant
     mean: np.ndarray
@@ -41,15 +41,15 @@ class Told(NamedTuple):
 
     @property
     def forward(self) -> FeedForward:
-        """What is fed forward; a gain that the record does not tell from zero is not."""
+        """The feed-forward. A gain that cannot be told from zero in the record is zero."""
         sure = np.abs(self.gain) >= DETERMINED * self.deviation
         return FeedForward(np.where(sure, self.gain, 0.0), self.mean, self.lead)
 
 
 def learn(acting: Sequence[np.ndarray], y: Sequence[np.ndarray], inputs: int) -> Told | None:
-    """Of segments y (T, p) and `acting` (T, m + q), the disturbances after the `inputs` m. One that stands
-    still, or only repeats other signals, has no effect and no gain. None if all do, the record is too short
-    for a window model, or that is unstable."""
+    """Learns the disturbances of segments y (T, p) and `acting` (T, m + q), which has the `inputs` m first. A
+    disturbance that is constant, or only repeats other signals, has no effect and no gain. Returns None if
+    all are like that, if the record is too short for a window model, or if the model is unstable."""
     whole = np.vstack(acting)
     q, columns = whole.shape[1] - inputs, whole.shape[1] + y[0].shape[1]
     tells = [k for k in range(q) if _own_share(whole, inputs + k) >= OWN]
@@ -68,18 +68,18 @@ def learn(acting: Sequence[np.ndarray], y: Sequence[np.ndarray], inputs: int) ->
     gains = np.array([_forward(one, inputs) for one in left if one is not None])
     gain, deviation = np.zeros((inputs, q)), np.full((inputs, q), np.nan)
     gain[:, tells] = _forward(model, inputs)
-    # jackknife over blocks; a block without which there is no stable model leaves everything open
+    # jackknife over blocks; if the model without one block is unstable, the deviation is unknown (NaN)
     if len(gains) == BLOCKS:
         deviation[:, tells] = np.sqrt((BLOCKS - 1) * gains.var(axis=0))
     d, lead = whole[:, inputs:], np.zeros(q)
-    # the middle of the models that each lack a block: one of the whole record may be chance
+    # the median of the models without one block, because that of the whole record may be chance
     lead[tells] = np.median([_lead(one, inputs) for one in left if one is not None] or [[0.0]], axis=0)
     return Told(effect, d.mean(axis=0), np.quantile(d, 0.95, axis=0), gain, deviation, lead)
 
 
 def _own_share(whole: np.ndarray, column: int) -> float:
-    """Share of a column's variance that the other columns (T, .) and a constant do not explain; 0 if it
-    stands still."""
+    """Returns the share of a column's variance that the other columns (T, .) and a constant do not explain; 0
+    if the column is constant."""
     others = np.column_stack([np.delete(whole, column, axis=1), np.ones(len(whole))])
     scale = np.maximum(np.abs(others).max(axis=0), 1e-300)
     mine = whole[:, column]
@@ -89,7 +89,7 @@ def _own_share(whole: np.ndarray, column: int) -> float:
 
 
 def _stable(acting: Sequence[np.ndarray], y: Sequence[np.ndarray], longest: int) -> Plant | None:
-    """The window model of a record; None if it is unstable, or the record too short for it."""
+    """Returns the window model of a record; None if it is unstable or the record is too short for it."""
     long_enough = [k for k in range(len(y)) if len(y[k]) > longest]
     try:
         model = window.learn(
@@ -104,7 +104,7 @@ def _stable(acting: Sequence[np.ndarray], y: Sequence[np.ndarray], longest: int)
 def _without(
     acting: Sequence[np.ndarray], y: Sequence[np.ndarray], block: int
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The record without one of BLOCKS equal parts of every segment."""
+    """Returns the record without one of BLOCKS equal parts of every segment."""
 
     def kept(parts: Sequence[np.ndarray]) -> list[np.ndarray]:
         ends = [np.linspace(0, len(part), BLOCKS + 1).astype(int)[block : block + 2] for part in parts]
@@ -115,14 +115,14 @@ def _without(
 
 
 def _forward(model: Plant, inputs: int) -> np.ndarray:
-    """F (m, q) of a window model."""
+    """Returns F (m, q) of a window model."""
     steady = model.C @ np.linalg.solve(np.eye(model.n) - model.A, model.B) + model.D
     return -np.linalg.pinv(steady[:, :inputs]) @ steady[:, inputs:]
 
 
 def _lead(model: Plant, inputs: int) -> np.ndarray:
-    """Samples (q,) by which the kick of each disturbance leaves the least squares of the outputs after a step
-    of it, with no feedback."""
+    """Returns the lead in samples (q,) with which the kick of each disturbance gives the least squares of the
+    outputs after a step of it, without feedback."""
     F, q = _forward(model, inputs), model.B.shape[1] - inputs
     step, kick, lead = np.ones(AHEAD), FADES ** np.arange(AHEAD), np.zeros(q)
     still = model._replace(b=0 * model.b, d=0 * model.d)
@@ -140,8 +140,8 @@ def _lead(model: Plant, inputs: int) -> np.ndarray:
 def at_mean(
     told: Told | None, acting: Sequence[np.ndarray], y: Sequence[np.ndarray], inputs: int
 ) -> list[np.ndarray]:
-    """y (T, p) of each piece as it would be with every disturbance at its mean, at rest before the first
-    sample; as recorded if nothing is told."""
+    """Returns y (T, p) of each piece as it would be with every disturbance at its mean. Before the first
+    sample the disturbances are assumed constant. If `told` is None, returns y as recorded."""
     if told is None:
         return list(y)
     effect = told.effect
@@ -153,7 +153,8 @@ def at_mean(
 
 
 def stored(told: Told) -> dict[str, tuple[np.ndarray, str, str]]:
-    """As named arrays with unit and meaning, for an artifact; `restored` reads them back."""
+    """Returns the disturbances as named arrays with unit and meaning, for an artifact; `restored` reads them
+    back."""
     return {
         "A": (told.effect.A, "1", "state matrix of what disturbances do"),
         "B": (told.effect.B, "per unit", "how disturbances enter it"),

@@ -1,16 +1,17 @@
-"""The governor: what keeps the predicted worst output of a family of plants within the limits of the
-outputs, whatever the law asks for.
+"""The governor (output limiter): keeps the predicted worst output of a family of plants within the limits of
+the outputs, whatever the law commands.
 
-A braking distance in each output: the command moves as little as it must, so that from the next step on every
-member of the family that the record has not contradicted could still be stopped below `high` by its lowest
-inputs, and above `low` by its highest. In the terms of a reference governor (Garone, Di Cairano,
-Kolmanovsky 2017): the reference moves to the one for which the law would have asked for that command, and
-back-calculation tells the integrator.
+It works like a braking distance in each output. The command is changed as little as possible, so that from
+the next step on every member of the family could still be stopped: below `high` by its lowest inputs, and
+above `low` by its highest. Members that the record contradicts are left out. In the terms of a reference
+governor (Garone, Di Cairano, Kolmanovsky 2017): the reference moves to the one for which the law would give
+that command, and back-calculation corrects the integrator.
 
-A member does not know how strongly its inputs act, only within what range. Its forecast is linear in that
-strength, so that it carries two: the strongest, and what lies between strongest and weakest; least squares on
-its innovations tells, output by output, where between them the machine is. What a member explains worse than
-another, whatever its strength (a delay that is not there), does not count for a while.
+The strength of a member's inputs is known only as a range. Its forecast is linear in that strength, so it
+carries two forecasts: one for the strongest, and one for the difference between strongest and weakest. Least
+squares on its innovations shows, output by output, where between them the machine is. A member that explains
+the innovations worse than another at any strength (for example, by a delay that does not exist) does not
+count for a while.
 """
 
 from collections.abc import Sequence
@@ -25,9 +26,9 @@ from pipeline.temperature.tracking import reached_state, riccati
 
 
 class OutputLimits(NamedTuple):
-    """low, high (p,) in °C, -inf and inf where none is declared; `margin` (p,) in °C is kept from both, for
-    the sensors' noise (three standard deviations); `overshoot` in °C: how far an output may be predicted
-    beyond its target."""
+    """low, high (p,) in °C, -inf and inf if none is declared. `margin` (p,) in °C is kept from both, for the
+    sensors' noise (three standard deviations). `overshoot` in °C: how far an output may be predicted beyond
+    its target."""
 
     low: np.ndarray
     high: np.ndarray
@@ -35,15 +36,15 @@ class OutputLimits(NamedTuple):
     overshoot: float
 
 
-# steps ahead at most
+# largest number of steps ahead
 LONGEST = 120
-# shares of its peak from which on a pulse response is looked at, and up to which closely
+# shares of a pulse response's peak: examined from REACHED on, in small steps up to SHOULDER
 REACHED, SHOULDER = 0.2, 0.9
-# share of what the innovations told that is forgotten a step, and of the drift, and with them the observer's
-# constants: for a furthest look ahead of so many steps; a machine that needs more is watched as much longer
+# shares that are forgotten per step, of the sums over innovations and of the drift. These and the observer's
+# constants hold for a furthest look ahead of UNHURRIED steps; they are scaled for a machine that needs more
 FORGETS, LEAK, UNHURRIED = 0.005, 1e-4, 16
-# overshoots that an output which has arrived may go beyond its target, if the whole range of the inputs for
-# one sample moves it by fewer overshoots than BARELY
+# an output that has arrived may be LET_GO overshoots beyond its target, if the whole range of the inputs for
+# one sample moves it by fewer than BARELY overshoots
 LET_GO, BARELY = 4.0, 20.0
 
 
@@ -56,13 +57,14 @@ def governor(
     tau: float = 0.2,
     drift: float = 0.06,
 ) -> Governor:
-    """The governor of a family of plants of one order (their feed-through made a delay), for inputs of any
-    `strength` within its range.
+    """Returns the governor of a family of plants of one order (their feed-through made a delay), for inputs
+    of any `strength` within its range.
 
-    Innovations are doubted by the sensors' noise, a tenth of a degree at least. The observer takes process
-    noise to come in by the inputs, sensors to be as much noisier as tau percent^2 of every input, and the
-    drift w to wander a step by `drift` of what a percent of every input does at most: the same whatever the
-    units. A machine that answers more slowly is watched as much longer, by the furthest instant ahead.
+    The uncertainty of the innovations follows the sensors' noise, at least a tenth of a degree. The observer
+    assumes that process noise enters through the inputs, and that sensor noise is as large as the effect of
+    tau percent^2 on every input. It assumes that the drift w changes per step by `drift` of the largest
+    effect of a percent of every input. So units do not matter. A machine that responds more slowly is
+    observed for longer, in proportion to the furthest instant ahead.
     """
     at, unsure = instants(family), np.maximum(outputs.margin, 0.1)
     slower = max(at[-1] / UNHURRIED, 1.0)
@@ -87,10 +89,11 @@ def governor(
 
 
 def _near(plant: Plant, limits: ActuatorLimits, overshoot: float, strength: Strength) -> np.ndarray:
-    """How far (p,) in °C an output that has arrived at its target may be predicted beyond it.
+    """Returns how far (p,) in °C an output that has arrived at its target may be predicted beyond it.
 
-    `overshoot` where one sample can do much. Where it can do little, the law's own small moves are as large
-    as the forecast's errors, of which a tight wall would make a steady error.
+    This is `overshoot` if one sample can have a large effect. If it has little effect, the law's own small
+    changes are as large as the errors of the forecast, and a tight limit would turn these into a steady
+    error.
     """
     pulse = np.abs(markov_parameters(plant, LONGEST)).max(axis=0)
     most = strength.strongest * pulse @ (limits.high - limits.low)
@@ -98,14 +101,14 @@ def _near(plant: Plant, limits: ActuatorLimits, overshoot: float, strength: Stre
 
 
 def instants(family: Sequence[Plant]) -> np.ndarray:
-    """Steps ahead at which the members are looked at: now; by steps of a quarter from that at which an
-    output's pulse response is first at REACHED of its peak to that at which every output's is at its
-    SHOULDER; and in ever wider steps from the first peak, to four times that after which the strongest of the
-    slowest member is, 16 at least.
+    """Returns the steps ahead at which the members are examined. The first is now. The next begin when an
+    output's pulse response first reaches REACHED of its peak, grow by a quarter, and end when every output's
+    has reached SHOULDER of its peak. Then ever wider steps follow, from the first peak to four times the step
+    of the slowest member's strongest peak, at least 16 and at most LONGEST.
 
-    Heat that is already on its way peaks in an output sooner than a pulse from now does: whoever looks from
-    the pulse's peak on sees it only when it is past. Nearer than REACHED a command does so little that every
-    error of the forecast would shut the inputs.
+    Heat that is already on its way peaks in an output sooner than a pulse from now does. A search that starts
+    at the pulse's peak finds it too late. Nearer than REACHED a command has so little effect that every error
+    of the forecast would shut the inputs.
     """
     pulses = [np.abs(markov_parameters(plant, LONGEST)).max(axis=2) for plant in family]
     first = 1 + min(int(pulse.argmax(axis=0).min()) for pulse in pulses)
@@ -121,8 +124,8 @@ def instants(family: Sequence[Plant]) -> np.ndarray:
 
 
 def drifting(plant: Plant, leak: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """A, C of the state [x; w]: w (p) in °C a step warms the outputs along the state that inputs most likely
-    reach; it leaks, so that no mode of it stands still unseen."""
+    """Returns A, C of the state [x; w]. w (p,), in °C a step, warms the outputs along the state that inputs
+    most likely reach. It leaks, so that none of its modes is both constant and unobservable."""
     n, p = plant.n, plant.p
     A = np.block([[plant.A, reached_state(plant)], [np.zeros((p, n)), (1 - leak) * np.eye(p)]])
     return A, np.hstack([plant.C, np.zeros((p, p))])
@@ -131,9 +134,10 @@ def drifting(plant: Plant, leak: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 def observer(
     plant: Plant, *, tau: float, drift: float, leak: float, lags: int = LONGEST
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A, C of the state [x; w], and M (n + p, p) that moves it by an innovation at once: process noise comes
-    in by the inputs, sensors are tau percent^2 of every input noisier, and the drift wanders a step by
-    `drift` of what a percent of every input does at most within `lags` steps."""
+    """Returns A, C of the state [x; w], and M (n + p, p), the immediate correction of the state per
+    innovation. Process noise enters through the inputs. Sensor noise is as large as the effect of tau
+    percent^2 on every input. The drift changes per step by `drift` of the largest effect of a percent of
+    every input within `lags` steps."""
     A, C = drifting(plant, leak)
     pulse = (np.abs(markov_parameters(plant, lags)).max(axis=0) ** 2).sum(axis=1)
     noise = scipy.linalg.block_diag(plant.B @ plant.B.T, drift**2 * np.diag(pulse))
@@ -145,7 +149,7 @@ def observer(
 def _watching(
     plant: Plant, strength: Strength, tau: float, drift: float, leak: float
 ) -> dict[str, np.ndarray]:
-    """The part of a Governor by which one member follows the machine."""
+    """Returns the part of a Governor with which one member follows the machine."""
     n, m, p = plant.n, plant.m, plant.p
     likely = reached_state(plant)
     A, C, L = observer(plant, tau=tau, drift=drift, leak=leak)
@@ -165,9 +169,9 @@ def _watching(
 
 
 def _ahead(plant: Plant, limits: ActuatorLimits, strength: Strength, at: np.ndarray) -> dict[str, np.ndarray]:
-    """The rows of a Governor of one member. A rate limit slows the stop: inputs go from u to the limit on a
-    straight line that the slowest of them needs. An input that helps is taken to act less than one that
-    hurts, by what `each` leaves open."""
+    """Returns the rows of a Governor for one member. A rate limit slows the stop: inputs go from u to the
+    limit on a straight line. An input that helps is assumed to act less than one that hurts, within the range
+    that `each` leaves open."""
     n, m, p = plant.n, plant.m, plant.p
     A, C = drifting(plant)
     B, b = np.vstack([plant.B, np.zeros((p, m))]), np.r_[plant.b, np.zeros(p)]

@@ -1,9 +1,9 @@
-"""The kernel of the value function from recorded inputs and outputs alone: Algorithm 2 of seed 1, and the
-same problem whitened, for any reference.
+"""Learns the kernel of the value function from recorded inputs and outputs alone: Algorithm 2 of seed 1, and
+the same problem whitened, for any reference.
 
-State: s = [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)], action u, v = [s; u], value v'H v (31). What the
-published form does with (84 x 84) Kronecker products a sample is done here with half-vectors on the range of
-the data: one Gram matrix, one operator G, and value iteration that never sees a sample again.
+State: s = [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)], action u, v = [s; u], value v'H v (31). The published
+form uses (84 x 84) Kronecker products for each sample. Here half-vectors on the range of the data do the
+same: one Gram matrix, one operator G, and value iteration that does not need the samples again.
 """
 
 from collections.abc import Sequence
@@ -20,14 +20,14 @@ ROOT2 = np.sqrt(2.0)
 
 
 def svec(S: np.ndarray) -> np.ndarray:
-    """Half-vector of a symmetric S (d, d): upper triangle by rows, sqrt 2 off the
-    diagonal, so that svec(S) . svec(T) = trace(S T)."""
+    """Returns the half-vector of a symmetric S (d, d): the upper triangle by rows, with off-diagonal entries
+    times sqrt 2, so that svec(S) . svec(T) = trace(S T)."""
     i, j = np.triu_indices(len(S))
     return S[i, j] * np.where(i == j, 1.0, ROOT2)
 
 
 def smat(h: np.ndarray, d: int) -> np.ndarray:
-    """The symmetric (d, d) matrix whose half-vector is h."""
+    """Returns the symmetric (d, d) matrix with half-vector h."""
     i, j = np.triu_indices(d)
     S = np.empty((d, d))
     S[i, j] = S[j, i] = h / np.where(i == j, 1.0, ROOT2)
@@ -35,7 +35,7 @@ def smat(h: np.ndarray, d: int) -> np.ndarray:
 
 
 def skron(X: np.ndarray) -> np.ndarray:
-    """The matrix with svec((X z)(X z)') = skron(X) svec(z z'), for X (a, d): shape (a (a+1)/2, d (d+1)/2)."""
+    """Returns skron(X) (a (a+1)/2, d (d+1)/2) with svec((X z)(X z)') = skron(X) svec(z z'), for X (a, d)."""
     (p, q), (k, j) = np.triu_indices(X.shape[0]), np.triu_indices(X.shape[1])
     product = X[p][:, k] * X[q][:, j]
     off = k != j
@@ -44,8 +44,8 @@ def skron(X: np.ndarray) -> np.ndarray:
 
 
 def quadratic_gram(Z: np.ndarray, *, block: int = 1024) -> np.ndarray:
-    """Sum over samples of svec(z z') svec(z z')' for Z (d, samples), accumulated in blocks: memory does not
-    grow with the number of samples."""
+    """Returns the sum over samples of svec(z z') svec(z z')' for Z (d, samples), accumulated in blocks, so
+    that memory does not grow with the number of samples."""
     d, samples = Z.shape
     i, j = np.triu_indices(d)
     gram, features = np.zeros((len(i), len(i)), order="F"), np.empty((len(i), block))
@@ -65,12 +65,12 @@ def quadratic_gram(Z: np.ndarray, *, block: int = 1024) -> np.ndarray:
 
 
 class Tuples(NamedTuple):
-    """One row a sample: state s (samples, k), input u (samples, m),
-    error e (samples, p), successor s_next (samples, k).
+    """One row per sample: state s (samples, k), input u (samples, m), error e (samples, p), successor s_next
+    (samples, k).
 
     s = features [w; 1]: `features` (k, N (m+p) + 1) maps the raw window w and a constant, so that a gain on s
-    is a gain on w. e = y - base: the closer the base (p,) lies to the record, the less its noise costs, since
-    the noise of the regression is 2 e'Q times the sensors'.
+    is a gain on w. e = y - base: the noise of the regression is 2 e'Q times the sensors' noise, so a base
+    (p,) close to the recorded outputs makes it small.
     """
 
     s: np.ndarray
@@ -83,8 +83,8 @@ class Tuples(NamedTuple):
 
 
 def window_shift(m: int, p: int, N: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A, B_u, B_y with w(t+1) = A w + B_u u + B_y y
-    for the window w = [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)]."""
+    """Returns A, B_u, B_y with w(t+1) = A w + B_u u + B_y y for the window w = [u(t-1); ...; u(t-N); y(t-1);
+    ...; y(t-N)]."""
     A = scipy.linalg.block_diag(np.eye(N * m, k=-m), np.eye(N * p, k=-p))
     B_u, B_y = np.zeros((N * (m + p), m)), np.zeros((N * (m + p), p))
     B_u[:m], B_y[N * m : N * m + p] = np.eye(m), np.eye(p)
@@ -94,8 +94,8 @@ def window_shift(m: int, p: int, N: int) -> tuple[np.ndarray, np.ndarray, np.nda
 def windows(
     u: Sequence[np.ndarray], y: Sequence[np.ndarray], N: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Windows (samples, N (m+p)), u and y of every row whose window is complete
-    within its segment and free of NaN (masked samples)."""
+    """Returns windows (samples, N (m+p)), u and y of every row whose window is complete within its segment
+    and free of NaN (masked samples). Raises ValueError if no segment is longer than N."""
     rows = []
     for us, ys in zip(u, y, strict=True):
         if len(us) > N:
@@ -113,8 +113,8 @@ def windows(
 
 
 def tuples(u: Sequence[np.ndarray], y: Sequence[np.ndarray], N: int, *, offset: bool = False) -> Tuples:
-    """The windows of segments u (T, m), y (T, p) for any reference: none is in s. `offset` puts a constant 1
-    into s (ambient, operating point), and then the mean of y is the base that e is counted from."""
+    """Returns the tuples of segments u (T, m), y (T, p). s holds no reference, so they serve for any.
+    `offset` puts a constant 1 into s (ambient, operating point); e is then counted from the mean of y."""
     w, u_now, y_now = windows(u, y, N)
     A, B_u, B_y = window_shift(u_now.shape[1], y_now.shape[1], N)
     one = np.ones((len(w), int(offset)))
@@ -125,8 +125,8 @@ def tuples(u: Sequence[np.ndarray], y: Sequence[np.ndarray], N: int, *, offset: 
 
 
 class Regression(NamedTuple):
-    """What the data say, whatever the weights, in the coordinates v = [W s; u / u_scale] with q = len(W)
-    whitened states:
+    """What the data say, for any weights, in the coordinates v = [W s; u / u_scale] with q = len(W) whitened
+    states:
 
     E[svec(s s')(t+1) | v] = svec(v v')' (skron(step)' + G)
     E[svec(e e') | v] = svec(v v')' G_e
@@ -134,9 +134,9 @@ class Regression(NamedTuple):
     E[s(t+1) | v] = step v
     E[e | v] = output v
 
-    W maps the raw window and a constant, [w; 1], on the whitened state. `unknowns`
-    half-vector entries are identifiable of `entries` in the published form, and as many
-    samples are needed; `condition` is that of the Gram matrix.
+    W maps the raw window and a constant, [w; 1], to the whitened state. `unknowns` half-vector entries are
+    identifiable and need at least as many samples; the published form has `entries`. `condition` is the
+    condition number of the Gram matrix.
     """
 
     G: np.ndarray
@@ -156,8 +156,8 @@ class Regression(NamedTuple):
     condition: float
 
     def stored(self) -> dict[str, tuple[np.ndarray, str, str]]:
-        """The regression as named arrays with unit and meaning, for an
-        artifact; `restored` reads them back."""
+        """Returns the regression as named arrays with unit and meaning, for an artifact; `restored` reads
+        them back."""
         return {name: (np.asarray(getattr(self, name), float), *_STORED[name]) for name in self._fields}
 
 
@@ -185,7 +185,7 @@ _STORED = {
 
 
 def restored(arrays: dict[str, np.ndarray]) -> Regression:
-    """The Regression whose `stored` arrays these are."""
+    """Returns the Regression from its `stored` arrays."""
     whole = ("N", "rank", "unknowns", "entries", "samples")
     return Regression(
         **{
@@ -196,8 +196,8 @@ def restored(arrays: dict[str, np.ndarray]) -> Regression:
 
 
 def whitening(s: np.ndarray, s_next: np.ndarray, *, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """W (q, k) that maps s on its range and makes its second moment the identity, from s and its successor
-    together; and all singular values (r.m.s.)."""
+    """Returns W (q, k), which maps s to its range and makes its second moment the identity, computed from s
+    and its successor together; and all singular values (r.m.s.)."""
     triangle = np.linalg.qr(np.vstack([s, s_next]), mode="r") / np.sqrt(2 * len(s))
     _, sv, Vt = np.linalg.svd(triangle)
     q = int((sv > tolerance * sv[0]).sum())
@@ -205,12 +205,12 @@ def whitening(s: np.ndarray, s_next: np.ndarray, *, tolerance: float) -> tuple[n
 
 
 def regress(data: Tuples, *, mu: float = 0.0, tolerance: float = 1e-9, limit: float = 1e13) -> Regression:
-    """Least squares of Algorithm 2, steps 2-8, on the range of the data,
-    done once for all weights, references and iterations.
+    """Solves the least squares of Algorithm 2, steps 2-8, on the range of the data, once for all weights,
+    references and iterations.
 
-    mu is the published ridge on vec(H) in the coordinates of s and u; it is carried through the whitening.
-    Directions of s below `tolerance` of the largest hold nothing but rounding. Raises ValueError where the
-    data do not determine the kernel, saying what is missing.
+    `mu`: the published ridge on vec(H) in the coordinates of s and u, carried through the whitening.
+    Directions of s below `tolerance` of the largest are rounding. Raises ValueError if the data do not
+    determine the kernel, or the condition number exceeds `limit`; the message says what is missing.
     """
     (samples, k), m, p = data.s.shape, data.u.shape[1], data.e.shape[1]
     W, sv = whitening(data.s, data.s_next, tolerance=tolerance)
@@ -232,8 +232,8 @@ def regress(data: Tuples, *, mu: float = 0.0, tolerance: float = 1e-9, limit: fl
     inside, outside = np.flatnonzero(of_v), np.flatnonzero(~of_v)
     wanted = np.vstack([skron(of_j[:q]), skron(of_j[q:]), skron(action)])
     normal = gram[np.ix_(inside, inside)]
-    # what is linear in v regresses on itself; left to solve for is the
-    # share of the innovation, and what the ridge holds back
+    # the part that is linear in v regresses on itself, so only the shares of the innovation and of the ridge
+    # must be solved for
     rest = gram[np.ix_(inside, outside)] @ wanted[:, outside].T
     if mu:
         ridge = _ridge(mu, W, u_scale, row[inside], column[inside])
@@ -266,14 +266,15 @@ def regress(data: Tuples, *, mu: float = 0.0, tolerance: float = 1e-9, limit: fl
 
 
 def _ridge(mu: float, W: np.ndarray, u_scale: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """The ridge mu on the entries (row, column) of the kernel of [s; u], in the whitened coordinates."""
+    """Returns the ridge mu on the entries (row, column) of the kernel of [s; u], in the whitened
+    coordinates."""
     size = np.concatenate([1 / np.linalg.norm(W, axis=1), u_scale])
     return mu / (size[row] * size[column]) ** 2
 
 
 def _innovation(residual: np.ndarray, size: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """What the successor and the error hold beyond v, as uncorrelated columns of unit variance, and the share
-    of each in the targets: residual = innovation share'."""
+    """Returns the part of successor and error that v does not explain, as uncorrelated columns of unit
+    variance, and the share of each in the targets: residual = innovation share'."""
     _, sv, Vt = np.linalg.svd(np.linalg.qr(residual, mode="r") / np.sqrt(len(residual)))
     rank = int((sv > tolerance * size.max()).sum())
     return residual @ Vt[:rank].T / sv[:rank], Vt[:rank].T * sv[:rank]
@@ -282,8 +283,9 @@ def _innovation(residual: np.ndarray, size: np.ndarray, tolerance: float) -> tup
 def _solve(
     normal: np.ndarray, right: np.ndarray, limit: float, samples: int, unknowns: int
 ) -> tuple[np.ndarray, float]:
-    """The normal equations by Cholesky after Jacobi scaling, and the condition number of the scaled matrix
-    (LAPACK's estimate, to six digits: the last of sixteen hangs on where in memory the factor lies)."""
+    """Solves the normal equations by Cholesky after Jacobi scaling. Returns the solution and the condition
+    number of the scaled matrix: LAPACK's estimate to six digits, because the last of sixteen depends on where
+    in memory the factor lies. Raises ValueError if it exceeds `limit`."""
     size = np.diag(normal)
     scale = 1 / np.sqrt(np.where(size > 0, size, 1.0))
     scaled = normal * scale * scale[:, None]
@@ -305,8 +307,8 @@ def _solve(
 def _refuse(
     data: Tuples, W: np.ndarray, u_scale: np.ndarray, unknowns: int, samples: int, mu: float, tolerance: float
 ) -> None:
-    """The refusals that name what is missing: an input that is silent, an
-    input that only repeats the window, too few samples."""
+    """Raises ValueError that names what is missing: an input is constant, an input follows from the window,
+    or there are too few samples."""
     silent = np.flatnonzero((u_scale == 0) | (np.ptp(data.u, axis=0) == 0))
     if silent.size:
         raise ValueError(
@@ -338,7 +340,7 @@ def _refuse(
 
 class Kernel(NamedTuple):
     """The learned kernel in whitened coordinates: H (q+m, q+m) for v, gains of u = -K w - K_r r - k on the
-    raw window w, and how the iteration ended."""
+    raw window w, the number of iterations and the last relative change of the gain."""
 
     H: np.ndarray
     K: np.ndarray
@@ -349,8 +351,8 @@ class Kernel(NamedTuple):
 
 
 def _greedy(H: np.ndarray, q: int) -> tuple[np.ndarray, np.ndarray]:
-    """K = H_uu^-1 H_us of (32), and P = H_ss - H_su K, the value after the greedy
-    input. Raises where H_uu is not positive definite."""
+    """Returns K = H_uu^-1 H_us of (32), and P = H_ss - H_su K, the value after the greedy input. Raises
+    ValueError if H_uu is not positive definite."""
     factor, failed = scipy.linalg.lapack.dpotrf(H[q:, q:], lower=1)
     if failed:
         raise ValueError(
@@ -370,21 +372,22 @@ def value_iteration(
     tolerance: float = 1e-6,
     max_iterations: int = 2000,
 ) -> Kernel:
-    """Algorithm 2, steps 5-9: h <- h_0 + gamma G svec(P(H)) until the gain changes by less than `tolerance`,
-    relatively; then the gains in the machine's units. A constant reference enters the value as 2 v'H_vr r,
-    exact for every r:
+    """Returns the kernel of Algorithm 2, steps 5-9: h <- h_0 + gamma G svec(P(H)) until the relative change
+    of the gain is below `tolerance`. The gains are in the machine's units. A constant reference enters the
+    value as 2 v'H_vr r, exact for every r:
 
     H_vr = -output'Q + gamma step'P_sr
     P_sr = [I -K'] H_vr
 
-    Q (p, p), R (m, m) weights. Stops on the gain, not on H, which creeps on at gamma^k. Raises ValueError
-    where the value grows without bound: the data describe no plant that these weights can hold.
+    Q (p, p), R (m, m): weights; `gamma`: discount. The gain decides when to stop, because H itself converges
+    only as slowly as gamma^k. Raises ValueError if the value grows without bound, so that the iteration does
+    not converge: the data describe no plant that these weights can hold.
     """
     q, m = len(data.W), len(data.u_scale)
     h_0 = data.G_e @ svec(Q) + data.G_u @ svec(R)
     row, column = np.triu_indices(q)
     weight = np.where(row == column, 1.0, ROOT2)
-    # svec and smat once for all iterations: which entry of h each entry of H is, and its weight
+    # svec and smat once for all iterations: the index in h of each entry of H, and its weight
     row_v, column_v = np.triu_indices(q + m)
     weight_v = np.where(row_v == column_v, 1.0, ROOT2)
     place, unweighted = smat(np.arange(len(h_0), dtype=float), q + m), smat(np.ones(len(h_0)), q + m)
@@ -417,8 +420,8 @@ def value_iteration(
 
 
 def window_law(K: np.ndarray, K_r: np.ndarray, k: np.ndarray, N: int, *, integral: float = 0.0) -> Law:
-    """u = -K w - K_r r - k on the window w of N past inputs and outputs, taking over with the history of the
-    hold: every slot filled with u0 and y0."""
+    """Returns u = -K w - K_r r - k on the window w of N past inputs and outputs. It takes over as if the hold
+    had lasted: every slot of w is filled with u0 and y0."""
     m, p = K_r.shape
     A, B_u, B_y = window_shift(m, p, N)
     start_u = np.vstack([np.tile(np.eye(m), (N, 1)), np.zeros((N * p, m))])
@@ -442,6 +445,6 @@ def window_law(K: np.ndarray, K_r: np.ndarray, k: np.ndarray, N: int, *, integra
 
 
 def law(learned: Regression, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral: float = 0.0) -> Law:
-    """Algorithm 2 on the window of past inputs and outputs."""
+    """Returns the law of Algorithm 2 on the window of past inputs and outputs."""
     solution = value_iteration(learned, Q, R, gamma)
     return window_law(solution.K, solution.K_r, solution.k, learned.N, integral=integral)

@@ -1,8 +1,8 @@
-"""The controller as it runs on the machine: a law with its limits, its target, its integrator, its governor
-and its hand-over.
+"""The controller as it runs on the machine: a law with its limits, target, integrator, governor and
+hand-over.
 
-One form for every contestant. `step` takes one sample, `batch_step` the same sample of many cases at once:
-the panel judges by the second what a machine would run by the first.
+All controllers have this form. `step` runs one sample on a machine, and `batch_step` the same sample of many
+cases at once, so the simulated controllers are those that a machine would run.
 
 With memory z, measured y, and the reference r(t) = H w(t), w(t+1) = F w(t) (seed 1, (2)):
 
@@ -10,12 +10,13 @@ With memory z, measured y, and the reference r(t) = H w(t), w(t+1) = F w(t) (see
     xi(t+1) = xi + integral (clip(y* - y) + clip(beyond(P (u - u wished))))
     z(t+1) = A z + B_u u + B_y y + B_r r + c
 
-Of disturbances d that are measured, F (d - mean d) is added to u before it is cut, and what the law remembers
-is u without it (FeedForward).
+For measured disturbances d, F (d - mean d) is added to u before u is cut. The law remembers u without this
+part (FeedForward).
 
-The target y* = Y w is the reference, or the nearest one that the inputs can hold. P = pinv(-K_r) says by how
-many °C another reference would have asked for the input that was applied: back-calculation, which acts on
-what lies beyond the integrator's own limit. What was applied, not what was wished, enters the memory.
+The target y* = Y w is the reference, or the nearest one that the inputs can hold. P = pinv(-K_r) turns the
+difference between applied and wished input into the change of reference in °C that would have caused it
+(back-calculation). Only the part beyond the integrator's own limit acts. The memory takes the applied input,
+not the wished one.
 """
 
 from collections.abc import Sequence
@@ -59,24 +60,24 @@ class Plant(NamedTuple):
 
 
 class Law(NamedTuple):
-    """A controller as it runs: memory z, measured y, reference r, and
-    the input that was really applied (clipped or not).
+    """A control law, with memory z, measured y, reference r and the input that was really applied (clipped or
+    not).
 
     u = -K z - D y - K_r (r + xi) - k
     z(t+1) = A z + B_u u_applied + B_y y + B_r r + c
     xi(t+1) = xi + integral (r - y)
 
-    Shapes with q memories: A (q, q), B_u (q, m), B_y (q, p), B_r (q, p), c (q,), K (m, q),
-    D (m, p), K_r (m, p), k (m,). It takes over from a plant that was held by u0 at y0
-    with z = start_u u0 + start_y y0 + start and xi = 0.
+    Shapes for a memory of size q: A (q, q), B_u (q, m), B_y (q, p), B_r (q, p), c (q,), K (m, q), D (m, p),
+    K_r (m, p), k (m,). It takes over from a plant that was held by u0 at y0 with z = start_u u0 + start_y y0
+    + start and xi = 0.
 
-    `integral` is the share of the error that xi takes a step: the outer integrator's, or that of a law with
-    integral action of its own, which puts its gain into K_r; where outputs take different shares, (p,) of
-    them, with no fewer inputs than outputs. No eigenvalue of A may be 1, because `aimed` solves (I - A) z for
-    the memory at rest: what integrates belongs into xi.
+    `integral`: share of the error that xi adds per step. This is the outer integrator, or the law's own
+    integral action, whose gain is then in K_r. It is (p,) if outputs have different shares; there must then
+    be at least as many inputs as outputs. No eigenvalue of A may be 1, because `aimed` solves (I - A) z for
+    the memory at rest. Integral action belongs in xi.
 
-    `conditional`: the law aims at no target. xi starts where -K_r xi is u0, takes every error in full, but
-    rests where the command is cut, and -K_r xi stays within the limits (conditional integration).
+    `conditional`: the law aims at no target. xi starts where -K_r xi is u0 and adds every error in full, but
+    rests while the command is cut. -K_r xi is kept within the limits (conditional integration).
     """
 
     A: np.ndarray
@@ -99,8 +100,8 @@ class Law(NamedTuple):
 
 
 class Target(NamedTuple):
-    """A steady state x (n,), u (m,) inside the limits with y (p,) as near the reference as the limits allow;
-    `miss` (p,) is y - r in °C, `slack` the distance of u from the nearest limit in percent."""
+    """A steady state x (n,), u (m,) within the limits, with y (p,) as near the reference as the limits allow.
+    `miss` (p,) is y - r in °C; `slack` is the distance of u from the nearest limit in percent."""
 
     x: np.ndarray
     u: np.ndarray
@@ -112,18 +113,18 @@ class Target(NamedTuple):
 def feasible_target(
     plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, *, tolerance: float = 1e-3
 ) -> Target:
-    """min |C x + d - r|^2 over x = A x + B u + b, low <= u <= high, and among its solutions one that keeps
-    all inputs as far from their limits as it can.
+    """Minimises |C x + D u + d - r|^2 over x = A x + B u + b, low <= u <= high. Among equal solutions it
+    takes one that keeps all inputs as far from their limits as possible.
 
-    The unlimited optimum asks heaters for negative heat; aimed at this target instead, the same gains settle
-    on the reference (temperature notes, 6). The slack costs at most `tolerance` °C of reach.
+    The unlimited optimum requests negative heat from heaters. With this target instead, the same gains settle
+    on the reference (temperature notes, 6). The slack may add at most `tolerance` °C to the miss.
     """
     nearest = _steady(plant, r, low, high, 0.0)
     reach, slack, step = np.linalg.norm(nearest.miss) + tolerance, 0.0, (high - low).min() / 4
     widest = 0.49 * (high - low).min()
     while step > 1e-3:
         wider = _steady(plant, r, low, high, slack + step)
-        # a target that the middle of the limits reaches as well has all the slack there is
+        # `widest` is the largest possible slack: u near the middle of its limits
         if slack + step <= widest and np.linalg.norm(wider.miss) <= reach:
             nearest, slack = wider, slack + step
         else:
@@ -132,7 +133,7 @@ def feasible_target(
 
 
 def _steady(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, slack: float) -> Target:
-    """Bounded least squares over u, the state eliminated."""
+    """Solves the bounded least squares over u, with the state eliminated."""
     per_u, at_rest = state_at_rest(plant)
     rows = np.vstack([plant.C @ per_u + plant.D, LIGHT * np.eye(plant.m)])
     right = np.concatenate([r - plant.d - plant.C @ at_rest, np.zeros(plant.m)])
@@ -144,26 +145,26 @@ def _steady(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, slac
 
 
 def state_at_rest(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
-    """X (n, m), x (n,): the state on which constant inputs u rest is X u + x = (I - A)^-1 (B u + b); a plant
-    that only integrates is taken to leak 1e-9 a step."""
+    """Returns X (n, m), x (n,) with the state at rest under constant inputs u: X u + x = (I - A)^-1 (B u +
+    b). A plant that only integrates is assumed to leak 1e-9 a step."""
     balance = _leaking(np.eye(plant.n) - plant.A)
     return np.linalg.solve(balance, plant.B), np.linalg.solve(balance, plant.b)
 
 
-# °C by which a percent of an input counts beside what outputs miss: of equally good inputs, the smaller
+# °C of miss that one percent of an input counts as: among equally good inputs the smaller wins
 LIGHT = 1e-6
-# shares below which a gradient, of what its terms come to, and a fall of the cost may be rounding
+# relative sizes below which a gradient (of the sum of its terms), and a fall of the cost, may be rounding
 ROUNDING, FALL = 1e-13, 1e-15
 
 
 def bounded_least_squares(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """x (n,) that minimises |A x - b|^2 within low..high (n,); A (rows, n), b (rows,): bounded-variable least
-    squares (Stark and Parker 1995), step by step as scipy.optimize.lsq_linear(method="bvls") takes them, so
-    that an exported file needs numpy only.
+    """Returns x (n,) that minimises |A x - b|^2 within low..high (n,); A (rows, n), b (rows,). Uses
+    bounded-variable least squares (Stark and Parker 1995) with the same steps as
+    scipy.optimize.lsq_linear(method="bvls"), so that an exported file needs numpy only.
 
-    But for one thing: what stands at a limit is set free only for a gradient that is more than rounding can
-    be. Where more inputs than outputs are free, as good as any is what is found first; which of them rounding
-    prefers is another on another CPU, and in C.
+    One difference: a variable at a limit is released only if its gradient is larger than rounding can make
+    it. If more inputs than outputs are free, many solutions are equally good, and the first one found is
+    taken. Otherwise rounding would choose, and would choose differently on another CPU, and in C.
     """
     x = np.linalg.lstsq(A, b, rcond=-1)[0]
     if np.all((x >= low) & (x <= high)):
@@ -191,7 +192,8 @@ def bounded_least_squares(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: n
 def _settle_free(
     A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, x: np.ndarray, at: np.ndarray
 ) -> None:
-    """Least squares of what is free; what leaves its limits is put there, until nothing does."""
+    """Solves the least squares of the free variables. Puts those that leave their limits at them, until none
+    does."""
     while (at == 0).any():
         free = np.flatnonzero(at == 0)
         z = np.linalg.lstsq(A[:, free], b - A.dot(x * (at != 0)), rcond=None)[0]
@@ -205,7 +207,8 @@ def _settle_free(
 def _moved_until_bound(
     A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, x: np.ndarray, at: np.ndarray
 ) -> bool:
-    """Moves x to the least squares of what is free, or until an input meets a limit; whether one did."""
+    """Moves x to the least-squares solution of the free variables, or until one reaches a limit. Returns
+    whether one did."""
     free = np.flatnonzero(at == 0)
     z = np.linalg.lstsq(A[:, free], b - A.dot(x * (at != 0)), rcond=None)[0]
     below, above = np.flatnonzero(z < low[free]), np.flatnonzero(z > high[free])
@@ -228,7 +231,8 @@ def _moved_until_bound(
 
 
 class ActuatorLimits(NamedTuple):
-    """low (m,) <= u <= high (m,) in percent, and at most `rate` (m,) percent a step; inf: none."""
+    """low (m,) <= u <= high (m,) in percent, changing by at most `rate` (m,) percent a step; inf means no
+    limit."""
 
     low: np.ndarray
     high: np.ndarray
@@ -236,8 +240,8 @@ class ActuatorLimits(NamedTuple):
 
 
 class Strength(NamedTuple):
-    """All inputs act `weakest` to `strongest` times as they do on the member; beside that each input differs
-    from the others by a factor within 1 +- `each`."""
+    """The range of input gains relative to a member's. All inputs act `weakest` to `strongest` times as
+    strongly. In addition, each input may differ from the others by a factor within 1 +- `each`."""
 
     weakest: float
     strongest: float
@@ -245,27 +249,28 @@ class Strength(NamedTuple):
 
 
 class Governor(NamedTuple):
-    """A family of f plants with their observers, and the rows by which they look ahead; `governor` makes it.
+    """A family of f plants with their observers, and the rows of their forecasts; `governor` makes it.
 
-    A member remembers s = [x, w, xi, v] of size q = 2 (n + p). x is its state at its strongest and w (p) in
-    °C a step a drift that it cannot explain, so that steady disagreement vanishes (offset-free prediction);
-    xi and v are by how much less x and w would be at its weakest. Before y is measured s forecasts
-    [C x + d, C xi]:
+    A member remembers s = [x, w, xi, v] of size q = 2 (n + p). x is its state at its strongest inputs. w
+    (p,), in °C a step, is a drift that the member cannot explain, so that a constant error vanishes
+    (offset-free prediction). xi and v are how much smaller x and w would be at its weakest inputs. Before y
+    is measured, s forecasts [C x + d, C xi]:
 
-        s <- s + [e, clip(e + lambda C xi), C xi, clip(C xi)] correct,   s(t+1) = s move + u push + rest
+            s <- s + [e, clip(e + lambda C xi), C xi, clip(C xi)] correct,   s(t+1) = s move + u push + rest
 
     with innovation e = y - C x - d, lambda in 0..1 between strongest and weakest, and an observer of the
-    stationary Riccati equation. w and v see up to `surprise` only: what is larger belongs to a transient, and
-    there to the strength of the inputs.
+    stationary Riccati equation. w and v use errors up to `surprise` only: a larger error belongs to a
+    transient, and there to the strength of the inputs.
 
-    Its output j, h instants ahead and at its strongest, is s ahead + above + strongest u rise, with lowest
-    inputs from the next step on, and with `below` and `fall` in their places with highest; the second half of
-    `ahead` tells what the weakest lacks. Rows run over outputs, then instants, of which the first is now.
+    The forecast of output j, h instants ahead and at its strongest, is s ahead + above + strongest u rise, if
+    the lowest inputs are applied from the next step on. With the highest inputs, `below` and `fall` take the
+    places of `above` and `rise`. The second half of `ahead` forecasts how much less it is at its weakest.
+    Rows run over outputs, then instants, of which the first is now.
 
     Shapes: see (f, q, 2 p), offset (f, p), correct (f, 4 p, q), move (f, q, q), push (f, m, q), rest (f, q),
-    start (f, p, q), start_0 (f, q), ahead (f, q, 2 p h), above, below (f, p h), rise, fall (f, m, p h); low,
-    high, surprise, doubt (p,) in °C, margins taken off: `doubt` is by how much an innovation may be off for
-    reasons other than the inputs' strength.
+    start (f, p, q), start_0 (f, q), ahead (f, q, 2 p h), above, below (f, p h), rise, fall (f, m, p h). low,
+    high, surprise, doubt (p,) in °C; low and high have their margins already subtracted. `doubt` is how far
+    an innovation may be off for reasons other than the strength of the inputs.
     """
 
     see: np.ndarray
@@ -291,27 +296,28 @@ class Governor(NamedTuple):
     overshoot: float
 
 
-# projections over all outputs, and over both sides: inputs mostly move one output each, so that a few suffice
+# repeats over all outputs, and over both sides: inputs mostly move one output each, so a few suffice
 SWEEPS, ROUNDS = 8, 2
-# percent by which rows are equal, or missed: one case by itself takes the same steps as among many
+# percent: smaller differences and violations of rows are ignored, so that a case takes the same steps alone
+# as among many
 EXACT = 1e-9
-# squares of innovations beyond those of the best member from which a member does not count
+# a member does not count if its squares of innovations are this many times those of the best member
 CONTRADICTED = 4.0
-# overshoots from its target within which an output has arrived
+# an output has arrived if it is within this many overshoots of its target
 ARRIVED = 2.0
-# an input that moves an output by less than this share of the strongest one is not held back for it
+# an input that moves an output by less than this share of the strongest one is not changed for it
 LEAST_EFFECT = 0.05
 
 
 def started(family: Governor, y: np.ndarray) -> np.ndarray:
-    """Memory (f, s, q + 4 p) of the members at measured outputs y (s, p): s of Governor, then four sums an
-    output, of -e C xi, (C xi)^2, |C xi| and e^2, older ones forgotten."""
+    """Returns the memory (f, s, q + 4 p) of the members at measured outputs y (s, p): s of Governor, then
+    four sums per output, of -e C xi, (C xi)^2, |C xi| and e^2, in which older samples are forgotten."""
     memory = np.matmul(y, family.start) + family.start_0[:, None]
     return np.concatenate([memory, np.zeros((*memory.shape[:2], 4 * y.shape[1]))], axis=2)
 
 
 def corrected(family: Governor, memory: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The memory once outputs y (s, p) are measured."""
+    """Returns the memory after outputs y (s, p) are measured."""
     q, p = family.start.shape[2], y.shape[1]
     s = memory[:, :, :q]
     forecast = np.matmul(s, family.see)
@@ -331,7 +337,7 @@ def corrected(family: Governor, memory: np.ndarray, y: np.ndarray) -> np.ndarray
 
 
 def predicted(family: Governor, memory: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """The corrected memory a sample on, inputs u (s, m) applied."""
+    """Returns the corrected memory one sample later, after inputs u (s, m)."""
     q = family.start.shape[2]
     after = memory.copy()
     after[:, :, :q] = np.matmul(memory[:, :, :q], family.move) + np.matmul(u, family.push)
@@ -340,15 +346,17 @@ def predicted(family: Governor, memory: np.ndarray, u: np.ndarray) -> np.ndarray
 
 
 def observed(family: Governor, memory: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The memory a sample after inputs u (s, m) were applied where y (s, p) was measured."""
+    """Returns the memory one sample after y (s, p) was measured and inputs u (s, m) were applied."""
     return predicted(family, corrected(family, memory, y), u)
 
 
 def evidence(family: Governor, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What the innovations tell of each member, case and output (f, s, p): the share of the way from
-    strongest to weakest that the inputs are at least, by least squares, and at most, every innovation up to
-    `doubt` off in the direction that matters; and whether the member counts (f, s). It does not where the
-    best member's squares are a quarter of its own, and its own more than noise."""
+    """Returns least, middle, most (f, s, p) and counts (f, s), from the innovations of each member and case.
+
+    middle: where the inputs act between strongest (0) and weakest (1), by least squares. least and most: the
+    same, if every innovation is off by up to `doubt` in the worse direction. counts: False for a member whose
+    squares are more than CONTRADICTED times those of the best member and more than noise.
+    """
     p = len(family.low)
     sums = memory[:, :, -4 * p :]
     product, square, size, own = (sums[:, :, k * p : (k + 1) * p] for k in range(4))
@@ -366,12 +374,12 @@ def evidence(family: Governor, memory: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def governed(
     family: Governor, memory: np.ndarray, u: np.ndarray, y_star: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Commands (s, m) as near to u (s, m) as the rows allow, within low..high (s, m); the memory corrected by
-    what was measured, y_star (s, p) targets.
+    """Returns commands (s, m) within low..high (s, m) that are as near to u (s, m) as the rows allow.
+    `memory`: corrected by the measured outputs; `y_star` (s, p): targets in °C.
 
-    Projections onto the most violated row of each output in turn. Only inputs whose lowering helps are
-    lowered for a high limit, and raised for a low one; the high limit has the last word. What cannot be kept
-    is kept as far as those inputs go.
+    Projects onto the most violated row of each output in turn. For a high limit only inputs whose lowering
+    helps are lowered; for a low limit only inputs whose raising helps are raised. The high limit is applied
+    last. A limit that cannot be kept is kept as far as those inputs allow.
     """
     q, rows = family.start.shape[2], family.above.shape[1]
     least, middle, most, counts = evidence(family, memory)
@@ -380,7 +388,7 @@ def governed(
         part.reshape(*part.shape[:2], y_star.shape[1], -1)
         for part in (ahead[:, :, :rows], ahead[:, :, rows:])
     )
-    # where an output is, is measured: how strong the inputs are is in doubt for what is still to come
+    # the present output is measured; the strength of the inputs is uncertain only for the future
     free, lacks = free - (middle * lacks[..., 0])[..., None], lacks - lacks[..., :1]
     now = free[..., 0] + family.offset[:, None]
     floor, cap = _walls(family, now, y_star)
@@ -392,7 +400,7 @@ def governed(
     above = _Side(bare, strongest - less * least, family.rise, counts, cap)
     u, raised = _projected(below, -u, -high)
     u, lowered = _projected(above, -u, low)
-    # where an input is lowered for one output and was raised for another, others may do what it did
+    # if inputs are raised for one output and lowered for another, other inputs may replace them
     both = np.intersect1d(raised, lowered, assume_unique=True)
     if both.size:
         below, above, one = below.of(both), above.of(both), u[both]
@@ -404,11 +412,15 @@ def governed(
 
 
 def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high; and `overshoot` beyond
-    the target, `near` where an output has arrived at it. What is up to a further `overshoot` off goes back,
-    so that small errors of the forecast do not add up; what is further off comes back as the law says, and
-    what is too hot gets no hotter. What is far too cold is left to the law: to keep it from cooling, inputs
-    of other outputs would have to heat, which those outputs' caps forbid, and both would swing."""
+    """Returns floor and cap (f, s, p) in °C of outputs that are forecast at `now` (f, s, p). They are the
+    limits low and high, and `overshoot` below and above the target, or `near` once the output has arrived at
+    it.
+
+    An output up to a further `overshoot` outside must return, so that small errors of the forecast do not add
+    up. An output farther outside is brought back by the law. If it is too hot, it may get no hotter. If it is
+    far too cold, it has no floor but `low`: to keep it from cooling, inputs of other outputs would have to
+    heat, which the caps of those outputs forbid, and both would oscillate.
+    """
     arriving, leaving = (
         np.where(sign * (y_star - now) < ARRIVED * family.overshoot, family.near, family.overshoot)
         for sign in (1.0, -1.0)
@@ -421,8 +433,9 @@ def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.nd
 
 
 class _Side(NamedTuple):
-    """What is forecast from above, or negated from below: bare (f, s, p, h) without the command, of which
-    strength (f, s, p) times u rows (f, m, p h) is to come; members that count (f, s); the wall (f, s, p)."""
+    """The forecast seen from above, or negated from below. bare (f, s, p, h): forecast without the command;
+    strength (f, s, p) times u rows (f, m, p h): effect of the command; counts (f, s): members that count;
+    wall (f, s, p)."""
 
     bare: np.ndarray
     strength: np.ndarray
@@ -436,8 +449,8 @@ class _Side(NamedTuple):
 
 
 def _projected(side: _Side, u: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """u (s, m) of `governed` for one side: bare + strength rows u <= wall where that can be kept; and which
-    cases a row touched."""
+    """Returns u (s, m) of `governed` for one side, with bare + strength rows u <= wall if that can be kept,
+    and the cases that a row changed."""
     driven = np.matmul(u, side.rows).reshape(side.bare.shape)
     over = side.bare + side.strength[..., None] * driven > side.wall[..., None]
     touched = np.flatnonzero((over.any(axis=(2, 3)) & side.counts).any(axis=0))
@@ -448,11 +461,11 @@ def _projected(side: _Side, u: np.ndarray, low: np.ndarray) -> tuple[np.ndarray,
 
 
 def _swept(side: _Side, u: np.ndarray, low: np.ndarray) -> np.ndarray:
-    """The projections of `governed` for cases that a row touches: u, low (s, m)."""
+    """Returns the projections of `governed` for cases in which a row is violated: u, low (s, m)."""
     f, s, p, h = side.bare.shape
     m = u.shape[1]
     rows = side.rows.reshape(f, m, p, h)
-    # what hardly moves an output is not shut for its sake
+    # an input that hardly moves an output is not changed for it
     helps = np.where(rows > LEAST_EFFECT * np.maximum(rows, 0.0).max(axis=1, keepdims=True), rows, 0.0)
     helps = np.maximum(helps, 0.0)
     least = np.matmul(low, helps.reshape(f, m, -1)) + np.matmul(u, (rows - helps).reshape(f, m, -1))
@@ -471,7 +484,7 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray) -> np.ndarray:
             worst = (excess >= most[:, None] - EXACT).argmax(axis=1)
             direction = helps[j, worst] * (u > low + EXACT)
             size = (direction**2).sum(axis=1)
-            # an output that is at fault in another case alone waits for the next sweep, as it does by itself
+            # an output violated only in another case waits for the next sweep, as it would alone
             step = np.where(at_fault[:, j] & (most > EXACT), most, 0.0) / np.where(size > 0, size, np.inf)
             u = np.maximum(u - step[:, None] * direction, low)
     return u
@@ -481,7 +494,7 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray) -> np.ndarray:
 
 
 class Reference(NamedTuple):
-    """r(t) = H w(t) in °C, w(t+1) = F w(t), w(0) = w0 with w0[0] = 1 that stays: F (k, k), H (p, k), w0
+    """r(t) = H w(t) in °C, w(t+1) = F w(t), w(0) = w0. w0[0] is 1 and stays constant. F (k, k), H (p, k), w0
     (k,)."""
 
     F: np.ndarray
@@ -489,7 +502,7 @@ class Reference(NamedTuple):
     w0: np.ndarray
 
     def states(self, steps: int) -> np.ndarray:
-        """w (steps, k)."""
+        """Returns w (steps, k)."""
         w = np.empty((steps, len(self.w0)))
         w[0] = self.w0
         for t in range(1, steps):
@@ -498,17 +511,18 @@ class Reference(NamedTuple):
 
 
 def constant(r: np.ndarray) -> Reference:
-    """r (p,) °C for ever."""
+    """Returns the constant reference r (p,) °C."""
     return Reference(np.eye(1), np.asarray(r, float)[:, None], np.ones(1))
 
 
 def ramp(r: np.ndarray, slope: np.ndarray) -> Reference:
-    """r + slope t: r (p,) °C, slope (p,) °C a step."""
+    """Returns the reference r + slope t: r (p,) °C, slope (p,) °C a step."""
     return Reference(np.array([[1.0, 0.0], [1.0, 1.0]]), np.column_stack([r, slope]), np.array([1.0, 0.0]))
 
 
 def sinusoid(mean: np.ndarray, amplitude: np.ndarray, period: float) -> Reference:
-    """mean + amplitude sin(2 pi t / period): mean, amplitude (p,) °C, period in steps."""
+    """Returns the reference mean + amplitude sin(2 pi t / period): mean, amplitude (p,) °C, period in
+    steps."""
     c, s = np.cos(2 * np.pi / period), np.sin(2 * np.pi / period)
     F = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
     return Reference(
@@ -517,7 +531,7 @@ def sinusoid(mean: np.ndarray, amplitude: np.ndarray, period: float) -> Referenc
 
 
 def same(reference: Reference, r: np.ndarray | Reference) -> bool:
-    """Whether r, a Reference or (p,) °C for ever, is the reference that there was."""
+    """Returns whether r, a Reference or a constant (p,) °C, equals `reference`."""
     if isinstance(r, Reference):
         return r is reference or all(map(np.array_equal, r, reference))
     return len(reference.w0) == 1 and bool((reference.H[:, 0] == r).all())
@@ -527,10 +541,10 @@ def same(reference: Reference, r: np.ndarray | Reference) -> bool:
 
 
 class Rest(NamedTuple):
-    """Inputs U w and outputs Y w on which a plant rests while the reference is H w: U (m, k), Y (p, k).
+    """Inputs U w and outputs Y w at which a plant rests while the reference is H w: U (m, k), Y (p, k).
 
-    `miss` (p,) is y* - r of the constant part in °C. `binding` are the inputs (index, limit in percent) that
-    stand at a limit where the reference is out of reach.
+    `miss` (p,) is y* - r of the constant part in °C. `binding`: if the reference is out of reach, the inputs
+    (index, limit in percent) that are at a limit.
     """
 
     U: np.ndarray
@@ -540,8 +554,9 @@ class Rest(NamedTuple):
 
 
 def rest(model: Plant, reference: Reference, limits: ActuatorLimits, *, tolerance: float = 0.01) -> Rest:
-    """The steady input of the constant part by a bounded quadratic programme (feasible_target), and
-    of what moves by the regulator equations X F = A X + B U, C X = H (Francis 1977)."""
+    """Returns where `model` rests under the reference. The constant part is a bounded quadratic programme
+    (feasible_target). The moving part solves the regulator equations X F = A X + B U, C X = H (Francis
+    1977)."""
     target = feasible_target(model, reference.H[:, 0], limits.low, limits.high)
     Y = reference.H.copy()
     Y[:, 0] = 0.0
@@ -560,16 +575,16 @@ def rest(model: Plant, reference: Reference, limits: ActuatorLimits, *, toleranc
 
 
 class Aim(NamedTuple):
-    """What a law adds to rest there: feed (m, k) and Y (p, k) of the module's formula."""
+    """feed (m, k) and Y (p, k) of the module's formula, which aim a law at a Rest."""
 
     feed: np.ndarray
     Y: np.ndarray
 
 
 def aim(law: Law, at: Rest, reference: Reference) -> Aim:
-    """feed = U + K Z + D Y, with the law's memory Z w on the way, Z F = A Z + B_u U + B_y Y + B_r H + [c 0].
-    A conditional law aims at no target: it sees the reference itself, and its own integral is all its
-    feed."""
+    """Returns the Aim of a law at a Rest: feed = U + K Z + D Y, with the law's memory Z w on the way, Z F = A
+    Z + B_u U + B_y Y + B_r H + [c 0]. A conditional law aims at no target: it gets the reference itself, and
+    its own integral replaces the feed."""
     if law.conditional:
         return Aim(-law.K_r @ reference.H, reference.H)
     drive = law.B_u @ at.U + law.B_y @ at.Y + law.B_r @ reference.H
@@ -579,8 +594,8 @@ def aim(law: Law, at: Rest, reference: Reference) -> Aim:
 
 
 def _triangular(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """S, V with F = V S V*, S upper triangular and V unitary: an eigenvalue at a time, whose eigenvector
-    becomes the next column of V (Golub and Van Loan 2013, 7.1)."""
+    """Returns S, V with F = V S V*, S upper triangular and V unitary. Takes one eigenvalue at a time; its
+    eigenvector becomes the next column of V (Golub and Van Loan 2013, 7.1)."""
     k = len(F)
     S, V = F + 0j, np.eye(k) + 0j
     for j in range(k - 1):
@@ -593,8 +608,8 @@ def _triangular(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sylvester(A: np.ndarray, F: np.ndarray, G: np.ndarray) -> np.ndarray:
-    """X (n, k) with X F = A X + G, column by column of F's Schur form; a mode of A that F excites is taken to
-    leak 1e-9 a step."""
+    """Returns X (n, k) with X F = A X + G, column by column of F's Schur form. A mode of A that F excites is
+    assumed to leak 1e-9 a step."""
     if not len(A):
         return G
     if len(F) == 1:
@@ -607,7 +622,7 @@ def _sylvester(A: np.ndarray, F: np.ndarray, G: np.ndarray) -> np.ndarray:
 
 
 def _regulated(model: Plant, F: np.ndarray, H: np.ndarray) -> np.ndarray:
-    """U (m, k), of least norm in each column of F's Schur form, with which the outputs follow H w."""
+    """Returns U (m, k) with which the outputs follow H w, of least norm in each column of F's Schur form."""
     S, V = _triangular(F)
     X, U = np.zeros((model.n, len(S)), complex), np.zeros((model.m, len(S)), complex)
     wanted = H @ V
@@ -629,30 +644,33 @@ def _leaking(balance: np.ndarray) -> np.ndarray:
 # ---- the law, a sample at a time
 
 
-AS_WISHED = 1e-9  # of an input's range, within which a command is the one that was wished
+AS_WISHED = 1e-9  # of an input's range: a command this near to the wished one counts as equal
 
 
 class FeedForward(NamedTuple):
-    """What makes up for measured disturbances d: inputs F (d - mean d + lead e), with F = `gain` (m, q) in
-    percent a unit of each, their `mean` (q,), at which nothing is added, and `lead` (q,) in samples. The kick
-    e of each follows its changes, because an input acts later than what it makes up for:
+    """The feed-forward that compensates measured disturbances d: it adds F (d - mean d + lead e) to the
+    inputs. F = `gain` (m, q) in percent per unit of each disturbance; `mean` (q,), at which nothing is added;
+    `lead` (q,) in samples. The kick e of each disturbance follows its changes, because an input acts later
+    than the disturbance:
 
-    e(t) = FADES e(t-1) + d(t) - d(t-1)"""
+    e(t) = FADES e(t-1) + d(t) - d(t-1)
+    """
 
     gain: np.ndarray
     mean: np.ndarray
     lead: np.ndarray
 
 
-FADES = 0.5  # of a kick a sample later
+FADES = 0.5  # share of a kick that is left one sample later
 
 
 class Deployed(NamedTuple):
-    """A law with what it runs under: `integral_limit` °C is the largest error, and the largest
-    back-calculated shift, that the integrator sees; `back` (p, m) is P of the module's formula; `shift` is k
-    where the memory moves on by k entries, 0 where it is no plain shift.
+    """A law with the conditions under which it runs. `integral_limit` in °C: the largest error, and the
+    largest back-calculated shift, that the integrator takes. `back` (p, m): P of the module's formula.
+    `shift`: k if the memory is a plain shift by k entries, otherwise 0.
 
-    `holds`: it does nothing, and goes on with the input that it was handed."""
+    `holds`: no control; the input at hand-over is kept.
+    """
 
     law: Law
     limits: ActuatorLimits
@@ -678,8 +696,8 @@ def deployed(
 
 
 def fed_forward(controller: Deployed, disturbances: np.ndarray, kick: np.ndarray | float = 0.0) -> np.ndarray:
-    """F (d - mean d + lead e) (..., m) in percent of disturbances d (..., q) and kicks e; of one that is not
-    told, NaN, the mean is taken."""
+    """Returns F (d - mean d + lead e) (..., m) in percent for disturbances d (..., q) and kicks e. For an
+    unknown disturbance (NaN) the mean is taken."""
     m = controller.law.D.shape[0]
     if controller.forward is None or controller.holds:
         return np.zeros((*np.shape(disturbances)[:-1], m))
@@ -688,14 +706,14 @@ def fed_forward(controller: Deployed, disturbances: np.ndarray, kick: np.ndarray
 
 
 def kicked(kick: np.ndarray, before: np.ndarray, disturbances: np.ndarray) -> np.ndarray:
-    """The kick e (..., q) of a sample on; of a disturbance that was not told before, or is not told now, it
-    fades."""
+    """Returns the kick e (..., q) one sample later. If a disturbance is unknown (NaN), before or now, its
+    kick only fades."""
     moved = disturbances - before
     return FADES * kick + np.where(np.isnan(moved), 0.0, moved)
 
 
 def all_fed_forward(controller: Deployed, disturbances: np.ndarray) -> np.ndarray:
-    """What is fed forward (T, ..., m) of disturbances (T, ..., q) sample by sample."""
+    """Returns the feed-forward (T, ..., m) for disturbances (T, ..., q), sample by sample."""
     kick = np.zeros(np.shape(disturbances))
     if controller.forward is not None and controller.forward.lead.any():
         before = disturbances[0]
@@ -706,10 +724,11 @@ def all_fed_forward(controller: Deployed, disturbances: np.ndarray) -> np.ndarra
 
 
 def compact(law: Law, N: int) -> Law:
-    """The same law of a window of N past inputs and outputs (kernel.window_law) with N m numbers of memory
-    instead of N (m+p): z_i is what the lags from i on will still ask for,
+    """Returns the same law of a window of N past inputs and outputs (kernel.window_law) with a memory of N m
+    numbers instead of N (m+p). z_i is the part of the coming command that the lags from i on already
+    determine. It starts where the window would.
 
-    z_i(t+1) = z_{i+1}(t) + K^u_i u(t) + K^y_i y(t), u = -z_1 - ..., and starts where the window would.
+        z_i(t+1) = z_{i+1}(t) + K^u_i u(t) + K^y_i y(t), u = -z_1 - ...
     """
     m, p = law.D.shape
     of_u, of_y = (
@@ -730,14 +749,14 @@ def compact(law: Law, N: int) -> Law:
 
 
 def _shift(A: np.ndarray) -> int:
-    """k where A is a plain shift by k, 0 where it is none."""
+    """Returns k if A is a plain shift by k, otherwise 0."""
     k = int(np.flatnonzero(A[0])[0]) if len(A) and A[0].any() else 0
     return k if k and np.array_equal(A, np.eye(len(A), k=k)) else 0
 
 
 class ControllerState(NamedTuple):
-    """All that a controller remembers, to be saved and restored: z (s, q), xi (s, p), the input u (s, m)
-    applied last, and the memory x (f, s, n) of the governor's family; s cases at once, one on a machine."""
+    """All that a controller remembers, to be saved and restored: z (s, q), xi (s, p), the last applied input
+    u (s, m), and the memory x (f, s, n) of the governor's family. s: cases at once, 1 on a machine."""
 
     z: np.ndarray
     xi: np.ndarray
@@ -753,8 +772,9 @@ def watched(
     r: np.ndarray,
     forward: np.ndarray | float = 0.0,
 ) -> ControllerState:
-    """The state after one sample in manual: inputs u (s, m) applied, outputs y (s, p) measured before,
-    reference r (s, p), and what would be fed `forward` (s, m). The first one starts it."""
+    """Returns the state after one sample in manual. `u` (s, m): inputs applied; `y` (s, p): outputs measured
+    before; `r` (s, p): reference; `forward` (s, m): the feed-forward at this sample. `state` is None at the
+    first sample."""
     law, family, acts = controller.law, controller.governor, u - forward
     if state is None:
         z = acts @ law.start_u.T + y @ law.start_y.T + law.start
@@ -771,10 +791,10 @@ def handed_over(
     here: Sequence[Aim],
     forward: np.ndarray | float = 0.0,
 ) -> ControllerState:
-    """The state in which the law takes over from manual without a bump: xi starts where the law, aimed at
-    where the machine is (`here`, an Aim of each case's y), would go on with the input of manual, up to
-    `integral_limit`. A conditional law starts its integral action at that input; one without integral action
-    has nothing that could hold a start, or let it go."""
+    """Returns the state in which the law takes over from manual without a bump. xi starts so that the law,
+    aimed at the present outputs, continues with the manual input, up to `integral_limit`. `here`: an Aim at
+    the y of each case. A conditional law starts its integral action at that input. A law without integral
+    action could neither keep such a start nor let it decay, so its state stays unchanged."""
     law = controller.law
     if controller.holds or not np.any(law.integral):
         return state
@@ -797,9 +817,9 @@ def batch_step(
     forward: np.ndarray | float = 0.0,
     applied: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, ControllerState]:
-    """Inputs (s, m) to apply, inputs wished, and the state a sample on, from measured y, reference r, target
-    y_star (s, p), feed w (s, m) and what is fed `forward` (s, m); `applied` (s, m) if the machine is given
-    others."""
+    """Returns the inputs (s, m) to apply, the wished inputs, and the state one sample later. `y` (s, p):
+    measured; `r` (s, p): reference; `feed` (s, m): feed w; `y_star` (s, p): target; `forward` (s, m):
+    feed-forward; `applied` (s, m): the inputs that the machine gets, if they differ."""
     law = controller.law
     if controller.holds:
         return state.u, state.u, state
@@ -821,8 +841,8 @@ def _allowed(
     y_star: np.ndarray,
     forward: np.ndarray | float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Inputs (s, m) as near to those wished, with what is fed `forward`, as the limits and the governor
-    allow, and the governor's memory corrected by y (s, p)."""
+    """Returns inputs (s, m) as near to `wished` plus `forward` as the limits and the governor allow, and the
+    governor's memory corrected by y (s, p)."""
     limits, family = controller.limits, controller.governor
     low = np.maximum(limits.low, np.minimum(state.u - limits.rate, limits.high))
     high = np.minimum(limits.high, np.maximum(state.u + limits.rate, limits.low))
@@ -834,11 +854,11 @@ def _allowed(
 
 
 def _integrated(controller: Deployed, xi, error, u, wished):
-    """xi (s, p) a sample on: the module's formula, or conditional integration (Law)."""
+    """Returns xi (s, p) one sample later, by the module's formula or by conditional integration (Law)."""
     law, most = controller.law, controller.integral_limit
     if law.conditional:
         after = xi + law.integral * error
-        # the command as wished, but for rounding: a replay sums in another order than what it replays
+        # equal to the wished command except for rounding, because a replay sums in another order
         inside = np.abs(u - wished) <= AS_WISHED * (controller.limits.high - controller.limits.low)
         within = (
             np.clip(-after @ law.K_r.T, controller.limits.low, controller.limits.high) @ controller.back.T
@@ -853,7 +873,7 @@ def _integrated(controller: Deployed, xi, error, u, wished):
 
 
 def _remembered(controller: Deployed, z, u, y, r):
-    """z (s, q) a sample on."""
+    """Returns z (s, q) one sample later."""
     law = controller.law
     after = u @ law.B_u.T + y @ law.B_y.T + r @ law.B_r.T + law.c
     if controller.shift:
@@ -871,7 +891,8 @@ INPUTS, REFERENCES = "inputs in percent", "references in °C"
 def numbers(
     values: np.ndarray | float, shape: tuple[int, ...], what: str, *, finite: bool = False
 ) -> np.ndarray:
-    """An array of a shape. Raises ValueError for another, and if `finite` is asked for and one is not."""
+    """Returns `values` as a float array. Raises ValueError if it does not have this shape, or if `finite` is
+    set and a value is not finite. `what` names the values in the message."""
     array = np.asarray(values, float)
     if array.shape != shape:
         raise ValueError(
@@ -887,7 +908,7 @@ def numbers(
 
 
 def _shapes(controller: Deployed) -> dict[str, tuple[int, ...]]:
-    """The shapes of ControllerState on one machine."""
+    """Returns the shapes of ControllerState on one machine."""
     (m, p), family = controller.law.D.shape, controller.governor
     x = (0, 1, 0) if family is None else (len(family.start), 1, family.start.shape[2] + 4 * p)
     return dict(zip(ControllerState._fields, ((1, len(controller.law.A)), (1, p), (1, m), x), strict=True))
@@ -896,11 +917,11 @@ def _shapes(controller: Deployed) -> dict[str, tuple[int, ...]]:
 class RunningController:
     """One controller on one machine, a sample at a time.
 
-    In manual, `watch` each sample; then `hand_over` once, then `step` each sample. A reference is (p,) °C, or
-    a Reference that starts at the sample where it is first given. It is aimed at on `model` when it changes,
-    and the last AIMS of them are remembered. All else that it remembers is `saved` as arrays, from which
-    `restore` goes on bit by bit. `binding` are the inputs (index, limit in percent) because of which the
-    reference is out of reach.
+    In manual, call `watch` each sample; then `hand_over` once, then `step` each sample. A reference is (p,)
+    °C, or a Reference that starts at the sample where it is first given. When the reference changes, the
+    controller computes its aim on `model` and keeps the last AIMS of them. `saved` returns all other memory
+    as arrays; after `restore` it continues with identical results. `binding`: if the reference is out of
+    reach, the inputs (index, limit in percent) that prevent it.
     """
 
     AIMS = 64
@@ -914,11 +935,11 @@ class RunningController:
         self._w, self._t = np.zeros(0), 0
         self.forward = np.zeros(len(controller.law.D))
         q = 0 if controller.forward is None else len(controller.forward.mean)
-        # disturbances as told now and a sample ago, and the kick of a sample ago
+        # disturbances now and one sample ago, and the kick one sample ago
         self._told, self._before, self._kick = np.full(q, np.nan), np.full(q, np.nan), np.zeros(q)
 
     def tell(self, disturbances: np.ndarray) -> None:
-        """The disturbances d (q,) from this sample on, NaN for one that is not known."""
+        """Sets the disturbances d (q,) from this sample on; NaN for an unknown one."""
         if self.controller.forward is not None:
             self._told = np.array(disturbances, float)
             self._feed_forward()
@@ -928,7 +949,8 @@ class RunningController:
         self.forward = fed_forward(self.controller, self._told, kick)
 
     def _passed(self) -> None:
-        """A sample on, with the disturbances as they were told; one that is told none is fed `forward`."""
+        """Advances the feed-forward by one sample. If no disturbance was ever given, keeps `forward` as it
+        is."""
         if np.isnan(self._told).all() and np.isnan(self._before).all():
             return
         self._kick = kicked(self._kick, self._before, self._told)
@@ -936,8 +958,8 @@ class RunningController:
         self._feed_forward()
 
     def watch(self, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> None:
-        """One sample in manual: inputs u (m,) applied, outputs y (p,) measured before, reference r (p,).
-        Raises ValueError for another number of them, or one that is not finite, and remembers nothing."""
+        """Takes one sample in manual: inputs u (m,) applied, outputs y (p,) measured before, reference r
+        (p,). Raises ValueError, and remembers nothing, if their number is wrong or one is not finite."""
         m, p = self.controller.law.D.shape
         u, r = numbers(u, (m,), INPUTS, finite=True), numbers(r, (p,), REFERENCES, finite=True)
         self._state = watched(
@@ -946,8 +968,8 @@ class RunningController:
         self._passed()
 
     def hand_over(self, y: np.ndarray, at: np.ndarray | None = None) -> None:
-        """From manual to the law without a bump, at outputs y (p,) measured now, where the machine stands at
-        `at` (p,), by itself y. Raises ValueError before any watch."""
+        """Hands over from manual to the law without a bump, at outputs y (p,) measured now. `at` (p,): where
+        the machine is, if not at y. Raises ValueError if `watch` was never called."""
         y = self._measured(y)
         here = self._aimed(constant(y if at is None else at))[1]
         self._state = handed_over(self.controller, self._remembers(), y[None], [here], self.forward)
@@ -955,9 +977,9 @@ class RunningController:
     def step(
         self, y: np.ndarray, r: np.ndarray | Reference, t: int, applied: np.ndarray | None = None
     ) -> np.ndarray:
-        """Inputs u (m,) to apply from outputs y (p,) measured at sample t under reference r, as batch_step
-        has them; `applied` (m,) if the machine is given others. Raises ValueError where y or r is not finite
-        or of another machine, where t falls, or nothing was watched before."""
+        """Returns inputs u (m,) to apply, from outputs y (p,) measured at sample t under reference r, as in
+        `batch_step`. `applied` (m,): the inputs that the machine gets, if they differ. Raises ValueError if y
+        or r is not finite or has the wrong shape, if t decreases, or if `watch` was never called."""
         y, state = self._measured(y), self._remembers()
         feed, y_star, now = (part[None] for part in self._target(r, t))
         given = None if applied is None else applied[None]
@@ -968,7 +990,7 @@ class RunningController:
         return u[0].copy()
 
     def saved(self) -> dict[str, np.ndarray]:
-        """All that it remembers, as arrays. Raises ValueError before the first watch."""
+        """Returns all memory as arrays. Raises ValueError before the first `watch`."""
         arrays = self._remembers()._asdict()
         arrays |= {"told": self._told, "before": self._before, "kick": self._kick}
         if self._reference is not None:
@@ -976,8 +998,8 @@ class RunningController:
         return {name: np.array(part) for name, part in arrays.items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Goes on from what another of the same law and governor `saved`. Raises ValueError where its arrays
-        are not those of this law and governor, or not finite."""
+        """Continues from the arrays that another controller of the same law and governor `saved`. Raises
+        ValueError if the arrays do not fit this law and governor, or are not finite."""
         state, told = ControllerState._fields, ("told", "before", "kick")
         mine = {name: np.array(arrays[name]) for name in (*state, *told) if name in arrays}
         given = {name: part.shape for name, part in mine.items()}
@@ -1016,7 +1038,7 @@ class RunningController:
         return y
 
     def _target(self, r: np.ndarray | Reference, t: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Feed (m,), target y* (p,) and reference (p,) at sample t."""
+        """Returns feed (m,), target y* (p,) and reference (p,) at sample t."""
         mine = self._reference
         if mine is not None and t < self._t:
             raise ValueError(f"sample {t} comes after sample {self._t}; count samples upwards")

@@ -1,21 +1,21 @@
-"""Data-enabled predictive control in gamma form: no model is identified; trajectories that the record holds
-are weighted so that the coming one costs least.
+"""Data-enabled predictive control in gamma form. No model is identified; the controller weights trajectories
+of the record so that the coming trajectory costs least.
 
-Samples t of the record are the columns of a block Hankel matrix: the past z = [1; u(t-1); ...; u(t-N);
+The columns of a block Hankel matrix are the samples t of the record: the past z = [1; u(t-1); ...; u(t-N);
 y(t-1); ...; y(t-N)], coming inputs u_f = [u(t); ...; u(t+T-1)] and outputs y_f = [y(t+1); ...; y(t+T)]. One
-LQ factorisation tells them apart, with uncorrelated entries of unit variance in gamma:
+LQ factorisation separates them, with uncorrelated entries of unit variance in gamma:
 
     [z  ]   [L11   0    0 ] [gamma_1]
     [u_f] = [L21  L22   0 ] [gamma_2]
     [y_f]   [L31  L32  L33] [gamma_3]
 
-gamma_1 = L11^-1 z is known, gamma_2 is chosen, and gamma_3, what neither past nor inputs explain, is forced
-to zero: y_f = L31 gamma_1 + L32 gamma_2 is then the least-squares predictor of each coming output. Blocks of
-L32 above the diagonal belong to inputs that come later than the output, and are zero. The law is
+gamma_1 = L11^-1 z is known, and gamma_2 is chosen. gamma_3 is the part that neither past nor inputs explain,
+and is set to zero. Then y_f = L31 gamma_1 + L32 gamma_2 is the least-squares predictor of each coming output.
+Blocks of L32 above the diagonal are zero, because they belong to inputs later than the output. The law is
 
     min over gamma_2   sum over k = 0 ... T-1 of gamma^k (gamma |y(t+k+1) - r|^2_Q + |u(t+k)|^2_R)
 
-in closed form: linear in the window, because limits, governor and integrator stand outside it.
+in closed form. It is linear in the window, because limits, governor and integrator are outside it.
 
 Breschi, Chiuso, Formentin, "Data-driven predictive control in a stochastic setting: a unified framework",
 Automatica (2023), its LQ form; the zeros of L32 are those of Sader et al., "Causality-informed data-driven
@@ -31,16 +31,16 @@ import scipy.linalg
 from pipeline.temperature.controllers.kernel import window_law
 from pipeline.temperature.tracking import Law
 
-TINY = 1e-12  # a signal that stands still is refused by what it lacks, not divided by 0
-ROWS = 2  # stretches of the record for each unknown of an output, at least
-SHORTEST = 5  # samples of a horizon
+TINY = 1e-12  # avoids a division by 0 for a constant signal, which is refused later for its lack of movement
+ROWS = 2  # least number of stretches of the record for each unknown of an output
+SHORTEST = 5  # samples: the shortest horizon
 
 
 class Trajectories(NamedTuple):
     """The factors of a record with m inputs and p outputs, in percent and °C.
 
-    past (q, N (m+p) + 1) makes gamma_1 from the raw window and a constant, [w; 1]. L21 (T m, q) and L22
-    (T m, T m) make coming inputs of gamma, L31 (T p, q) and L32 (T p, T m) coming outputs.
+    past (q, N (m+p) + 1) gives gamma_1 from the raw window and a constant, [w; 1]. L21 (T m, q) and L22 (T m,
+    T m) give coming inputs from gamma_1 and gamma_2; L31 (T p, q) and L32 (T p, T m) give coming outputs.
     """
 
     past: np.ndarray
@@ -68,14 +68,14 @@ _STORED = {
 
 
 def restored(arrays: dict[str, Any]) -> Trajectories:
-    """The Trajectories whose `stored` arrays these are."""
+    """Returns the Trajectories from their `stored` arrays."""
     return Trajectories(**arrays)._replace(N=int(arrays["N"]), samples=int(arrays["samples"]))
 
 
 def horizon(windows: int, segments: int, N: int, m: int, p: int, *, longest: int) -> int:
-    """The horizon T: `longest`, or the longest that half of every segment of a record with so many complete
-    `windows` of N samples determines, so that a half can be compared with the whole. Raises ValueError if
-    that is less than SHORTEST."""
+    """Returns the horizon T in samples: `longest`, or the longest one that half of every segment determines,
+    so that a half can be compared with the whole. `windows`: complete windows of N samples in the record.
+    Raises ValueError if T is less than SHORTEST."""
     least = ROWS * (1 + N * (m + p)) + segments * N
     T = min(longest, (windows // 2 - least) // (ROWS * m + segments))
     if T < SHORTEST:
@@ -90,9 +90,9 @@ def horizon(windows: int, segments: int, N: int, m: int, p: int, *, longest: int
 def hankel_rows(
     u: Sequence[np.ndarray], y: Sequence[np.ndarray], N: int, T: int, *, block: int = 2048
 ) -> Iterator[np.ndarray]:
-    """Rows [u(t-1) ... u(t-N), y(t-1) ... y(t-N), u(t) ... u(t+T-1), y(t+1) ... y(t+T)] of the transposed
-    Hankel matrix, at most `block` at a time: every t at which all of them lie in one segment u (samples, m),
-    y (samples, p) without a NaN."""
+    """Yields rows [u(t-1) ... u(t-N), y(t-1) ... y(t-N), u(t) ... u(t+T-1), y(t+1) ... y(t+T)] of the
+    transposed Hankel matrix, at most `block` at a time. A row exists for every t for which all of them lie in
+    one segment u (samples, m), y (samples, p) without a NaN."""
     past, coming = -np.arange(1, N + 1), np.arange(T)
     for inputs, outputs in zip(u, y, strict=True):
         instants = np.arange(N, len(inputs) - T)[:, None]
@@ -112,16 +112,17 @@ def learn(
     gain_spread: float = 0.0,
     tolerance: float = 1e-9,
 ) -> Trajectories:
-    """The factors from segments u (samples, m), y (samples, p), in blocks of rows: memory grows with N and T,
-    not with the record. Directions of z below `tolerance` of the largest are rounding. Raises ValueError if
-    there are fewer rows than ROWS times the unknowns of an output, or if an input follows from the past."""
+    """Computes the factors from segments u (samples, m), y (samples, p), in blocks of rows, so that memory
+    grows with N and T but not with the record. Directions of z below `tolerance` of the largest are rounding.
+    `gain_spread` as in window.learn. Raises ValueError if there are fewer rows than ROWS times the unknowns
+    of an output, or if an input follows from the past."""
     m, p = u[0].shape[1], y[0].shape[1]
     k, of_u = 1 + N * (m + p), T * m
     signals = np.hstack([np.vstack(u), np.vstack(y)])
     of_column = np.concatenate(
         [np.tile(names, count) for count in (N, T) for names in (np.arange(m), np.arange(m, m + p))]
     )
-    # z is counted from the mean, so that its constant stands apart
+    # z is counted from its mean, which separates the constant
     mean = np.where(np.arange(len(of_column)) < k - 1, np.nanmean(signals, axis=0)[of_column], 0.0)
     scale = np.maximum(np.nanstd(signals, axis=0), TINY)[of_column]
     triangle, samples = _triangle(hankel_rows(u, y, N, T), mean, scale)
@@ -166,8 +167,8 @@ def learn(
 
 
 def _triangle(blocks: Iterable[np.ndarray], mean: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, int]:
-    """R of the QR factorisation of [1, (rows - mean) / scale], a block of rows after the other, and how many
-    rows there are."""
+    """Returns R of the QR factorisation of [1, (rows - mean) / scale], computed one block of rows after the
+    other, and the number of rows."""
     triangle, samples = np.zeros((0, 1 + len(mean))), 0
     for rows in blocks:
         columns = np.hstack([np.ones((len(rows), 1)), (rows - mean) / scale])
@@ -177,7 +178,8 @@ def _triangle(blocks: Iterable[np.ndarray], mean: np.ndarray, scale: np.ndarray)
 
 
 def _alone(triangle: np.ndarray, mine: np.ndarray) -> np.ndarray:
-    """Rows whose squares sum to the second moment of the columns `mine` alone, with a constant of 0."""
+    """Returns rows whose squares sum to the second moment of the columns `mine` alone, with a constant of
+    0."""
     rows = np.linalg.qr(triangle[:, mine], mode="r")
     alone = np.zeros((len(rows), 1 + len(mine)))
     alone[:, 1:][:, mine] = rows
@@ -185,7 +187,8 @@ def _alone(triangle: np.ndarray, mine: np.ndarray) -> np.ndarray:
 
 
 def law(learned: Trajectories, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral: float = 0.0) -> Law:
-    """The first inputs of the cheapest trajectory as a law of the window, for weights Q (p, p) and R (m, m):
+    """Returns the first inputs of the cheapest trajectory as a law of the window, for weights Q (p, p) and R
+    (m, m):
 
     gamma_2 = (L32'Q L32 + L22'R L22)^-1 (L32'Q (r - L31 gamma_1) - L22'R L21 gamma_1)
     u(t) = L21 gamma_1 + L22 gamma_2

@@ -1,15 +1,16 @@
-"""The printer's own PID beside the others: Klipper's (klippy/extras/heaters.py, class ControlPID).
+"""The printer's own PID, for comparison: Klipper's (klippy/extras/heaters.py, class ControlPID).
 
-With e = r - y, once a sample of T = 0.3 s, Klipper computes
+With e = r - y, once per sample of T = 0.3 s, Klipper computes
 
     d(t) = ((a - T) d(t-1) + y(t) - y(t-1)) / a,  a = max(smooth time, T)
     I(t) = I(t-1) + T e(t), within 0 ... most / Ki
     u(t) = Kp e(t) + Ki I(t) - Kd d(t), cut to 0 ... most
 
-and keeps I(t) only where u was not cut. Here T is our sample time, and I is held within the machine's limits
-after u is computed, not before. Where our T is longer, d is what Klipper's own samples give if y runs
-straight between two of ours: at 1 s its formula smooths nothing, and calls loops unstable that are stable at
-0.3 s. u is held for our T, which costs margin: a loop near the edge may be stable at 0.3 s and not here.
+and keeps the new I(t) only if u was not cut. Here T is our sample time, and I is kept within the machine's
+limits after u is computed, not before. If our T is longer, d is what Klipper's own samples would give if y
+were a straight line between two of ours. At T = 1 s Klipper's formula would not smooth at all, and loops that
+are stable at 0.3 s would appear unstable. u is constant for our T, which reduces the margin, so a loop near
+the limit may be stable at 0.3 s but not here.
 """
 
 from typing import NamedTuple
@@ -19,14 +20,14 @@ import numpy as np
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.tracking import Law
 
-# Klipper reads a heater's thermistor so often (klippy/extras/adc_temperature.py, REPORT_TIME)
+# interval at which Klipper reads a heater's thermistor (klippy/extras/adc_temperature.py, REPORT_TIME)
 KLIPPER_S = 0.3
 
 
 class HeaterPid(NamedTuple):
-    """The PID of one heater, from output `output` to input `input` of the plant: Kp in percent per °C, Ki in
-    percent per °C and s, Kd in percent times s per °C; it ends at `most_percent`, and its derivative is
-    smoothed over `smooth_s`."""
+    """The PID of one heater, from output `output` to input `input` of the plant. Kp in percent per °C, Ki in
+    percent per °C and s, Kd in percent times s per °C; the command is limited to `most_percent`, and the
+    derivative is smoothed over `smooth_s`."""
 
     input: int
     output: int
@@ -38,8 +39,9 @@ class HeaterPid(NamedTuple):
 
 
 def law_of_printer(pids: tuple[HeaterPid, ...], plant: Plant, limits: tuple[np.ndarray, np.ndarray]) -> Law:
-    """The PIDs of all heaters as one law. `limits` low and high (m,) in percent. Raises ValueError where the
-    heaters' PIDs are not the whole control of the machine."""
+    """Returns the PIDs of all heaters as one law. `limits`: low and high (m,) in percent. Raises ValueError
+    if the heaters' PIDs do not control every input and output of the machine, if a gain has the wrong sign,
+    or if an input may go higher than its PID's maximum."""
     pids = tuple(sorted(pids, key=lambda pid: pid.output))
     inputs = sorted(pid.input for pid in pids)
     if [pid.output for pid in pids] != list(range(plant.p)) or inputs != list(range(plant.m)):
@@ -62,11 +64,14 @@ def law_of_printer(pids: tuple[HeaterPid, ...], plant: Plant, limits: tuple[np.n
 
 
 def law(pids: tuple[HeaterPid, ...], *, sample_time_s: float) -> Law:
-    """Klipper's PIDs as one law, in the order of the outputs; memory z = [y(t-1); d(t-1)].
+    """Returns Klipper's PIDs as one law, in the order of the outputs; memory z = [y(t-1); d(t-1)].
 
-    d(t) = phi d(t-1) + (1 - phi) (y(t) - y(t-1)) / T with phi = (1 - 0.3 s / a)^(T / 0.3 s). Of Ki I(t) the
-    part Ki T e(t) joins the proportional gain G = Kp + Ki T, and the rest is G xi(t) with xi(t+1) = xi(t) +
-    Ki T / G e(t): u = G (r + xi - y) - Kd d.
+    d(t) = phi d(t-1) + (1 - phi) (y(t) - y(t-1)) / T
+    phi = (1 - 0.3 s / a)^(T / 0.3 s)
+    u = G (r + xi - y) - Kd d
+    xi(t+1) = xi(t) + Ki T / G e(t)
+
+    Ki I(t) is split: its part Ki T e(t) joins the proportional gain G = Kp + Ki T, and the rest is G xi(t).
     """
     p, T = len(pids), sample_time_s
     Kp, Ki, Kd, smooth = (

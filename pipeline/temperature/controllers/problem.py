@@ -1,4 +1,4 @@
-"""What every controller is designed from, and what a design is."""
+"""The problem from which every controller is designed, and the result, a design."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ if TYPE_CHECKING:
 
 
 class DesignProblem(NamedTuple):
-    """What a controller may be designed from.
+    """The information from which a controller may be designed.
 
-    `plant` is identified, its feed-through a delay, `family` its spread, and `window` learned from the
-    record. `kernel` and `trajectories` are None if the record does not determine them, and `undetermined`
-    then says why, by controller. `truth` is None if nobody knows the plant, `printer_pid` empty if no
-    recording holds the PID of a printer. `gamma` is the discount, `exact_tau` the paper's observer, `horizon`
-    in steps, `noise` (p,) in °C."""
+    `plant`: identified, with feed-through as a delay; `family`: its spread; `window`: learned from the
+    record. `kernel` and `trajectories` are None if the record does not determine them; `undetermined` then
+    gives the reason, by controller. `truth` is None if the true plant is unknown. `printer_pid` is empty if
+    no recording contains the PID of a printer. `gamma`: discount; `exact_tau`: tau of the paper's observer;
+    `horizon`: steps; `noise` (p,): °C.
+    """
 
     plant: Plant
     family: list[Plant]
@@ -44,16 +45,16 @@ class DesignProblem(NamedTuple):
 
     @property
     def effect(self) -> float:
-        """°C^2 per percent^2 by which the strongest input of the median output moves it in a step: the scale
-        of an effort weight."""
+        """°C^2 per percent^2: the square of the largest effect per step of the strongest input on the median
+        output. It scales an effort weight."""
         strongest = np.abs(markov_parameters(self.plant, min(self.horizon, 50))).max(axis=(0, 2))
         return float(max(np.median(strongest), 1e-6)) ** 2
 
 
 class Design(NamedTuple):
     """A controller's law, and the plant on which its steady inputs are computed. `plain` designs the same
-    without integrator at the weights of the yardstick, and is None if weights mean nothing to it.
-    `governed`: the governor watches it. `holds`: it does nothing."""
+    controller without integrator at weights of one; it is None if the controller has no weights. `governed`:
+    the governor limits it. `holds`: no control."""
 
     law: Law
     model: Plant
@@ -63,10 +64,10 @@ class Design(NamedTuple):
 
 
 def weights(problem: DesignProblem, values: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
-    """diag(Q) = 1 and diag(R) = effort_weight: only their ratio acts."""
+    """Returns diag(Q) = 1 and diag(R) = effort_weight; only their ratio matters."""
     return np.ones(problem.plant.p), np.full(problem.plant.m, values["effort_weight"])
 
 
 def unit_weights(problem: DesignProblem) -> tuple[np.ndarray, np.ndarray, float]:
-    """Q = I, R = I and no integrator: the weights of the yardstick."""
+    """Returns diag(Q) = 1, diag(R) = 1 and integral 0: the weights of the common cost, without integrator."""
     return np.ones(problem.plant.p), np.ones(problem.plant.m), 0.0

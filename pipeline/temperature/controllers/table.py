@@ -1,8 +1,8 @@
 """The table of controllers: every controller of the temperature comparison, the simplest first.
 
-A new controller is a file of its own beside this one and a row in CONTROLLERS. Tuning, evaluation and
-certificate design controllers from this table; pages take heading, mark, kind and explanation from it. A
-method is imported when it is designed: a page loads none.
+A new controller is its own file in this folder and a row in CONTROLLERS. Tuning, evaluation and certificate
+design controllers from this table; pages take heading, mark, kind and explanation from it. The module of a
+method is imported only when it is designed, so a page imports none.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ Values = Mapping[str, float]
 
 
 class TuningParameter(NamedTuple):
-    """What a search may set, between low and high, from the declared start; times the problem's effect where
-    `of_effect`."""
+    """A parameter that a search may set between low and high, beginning at `start`. With `of_effect` all
+    three are multiplied by the problem's effect."""
 
     name: str
     low: float
@@ -37,18 +37,18 @@ INTEGRAL = TuningParameter("integral", 0.004, 0.04, 0.4)
 
 
 class TemperatureController(NamedTuple):
-    """A controller of the comparison: how it is designed, and what the pages say of it.
+    """A controller of the comparison: how it is designed, and its description on the pages.
 
-    `heading` and `method` stand above its column, `explanation` among the words of the page, below `word` if
-    the heading alone would say too little. `design` returns None if the record does not allow the controller,
-    and raises ValueError if the machine does not: the page shows that sentence in its column. `parameters`
-    are what its search may set; without any nothing is searched. `learned_from` says whose need of samples is
-    its own: the identified plant, the window, the kernel, or the trajectories.
+    `heading` and `method` stand above its column, and `explanation` in the page's list of terms, under `word`
+    if the heading alone says too little. `design` returns None if the record does not allow the controller.
+    It raises ValueError if the machine does not; the page shows the message in its column. `parameters` are
+    those that its search may set; without any there is no search. `learned_from` names the model whose
+    required number of samples applies: the identified plant, the window, the kernel, or the trajectories.
 
-    `kind` is declared here and nowhere guessed from a name: model-based (a model is identified and then
+    `kind` is declared here and never guessed from a name: model-based (a model is identified and then
     inverted or optimised), data-driven (the law is learned from the record without such a model), baseline,
     or reference. A reference is shown beside the others and is never the best. `mark` is the class of its
-    mark; one without takes the next free shape.
+    mark in charts; a controller without one gets the next free shape.
     """
 
     name: str
@@ -65,7 +65,8 @@ class TemperatureController(NamedTuple):
 
 
 def in_file(file: str, function: str = "design") -> Callable[[DesignProblem, Values], Design | None]:
-    """The function of a file in pipeline/temperature/controllers, loaded when it first designs."""
+    """Returns a function of a file in pipeline/temperature/controllers, which is imported when it first
+    designs."""
     return functools.partial(_design, f"pipeline.temperature.controllers.{file}", function)
 
 
@@ -82,7 +83,7 @@ CONTROLLERS = (
         in_file("designs", "hold"),
         "baseline",
     ),
-    # only where a recording is a Klipper log
+    # only if a recording is a Klipper log
     TemperatureController(
         "printer_pid",
         "Printer",
@@ -191,22 +192,23 @@ UNTUNED = "it could not be tuned: no candidate of its search kept the least marg
 def bounds(
     controller: TemperatureController, problem: DesignProblem
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lowest, start and highest of each parameter (d,)."""
+    """Returns the lowest, start and highest value of each parameter (d,)."""
     scale = [problem.effect if one.of_effect else 1.0 for one in controller.parameters]
     table = np.array([(one.low, one.start, one.high) for one in controller.parameters]).T * scale
     return table[0], table[1], table[2]
 
 
 def parameters(controller: TemperatureController, theta: Iterable[float]) -> dict[str, float]:
-    """The values theta (d,) by the names of the controller's parameters."""
+    """Returns the values theta (d,) by the names of the controller's parameters."""
     return dict(zip([one.name for one in controller.parameters], theta, strict=True))
 
 
 def answering_pair(standing: Iterable[str], tuned_costs: Mapping[str, float]) -> tuple[str, str]:
-    """The model-based controller and the data-driven one that answer "model-based or data-driven?": of each
-    kind, of those that stand, the one that its search found cheapest on the training plants, so that the
-    plants that compare the two have no say in who is compared. If no data-driven one stands, the second
-    model-based one takes its place; a kind of which none stands is named by its first row."""
+    """Returns the model-based and the data-driven controller that answer "model-based or data-driven?". Of
+    each kind it takes the one of `standing` with the lowest cost in its search on the training plants. So the
+    plants that compare the two do not influence which two are compared. If no data-driven one is in
+    `standing`, the second model-based one takes its place. A kind with none in `standing` is represented by
+    its first row."""
     standing = set(standing)
 
     def ranked(kind: str) -> list[str]:
@@ -223,8 +225,8 @@ def answering_pair(standing: Iterable[str], tuned_costs: Mapping[str, float]) ->
 def design_controllers(
     problem: DesignProblem, tuned: Mapping[str, Mapping[str, Any]]
 ) -> tuple[dict[str, Design], dict[str, str]]:
-    """Every controller that the record and the machine allow, at its tuned parameters, and by name why others
-    are refused. Raises ValueError if there is none but doing nothing."""
+    """Returns every controller that the record and the machine allow, at its tuned parameters, and the
+    reasons for refusing others, by name. Raises ValueError if only "hold" is left."""
     designs, refused = {}, {}
     for controller in CONTROLLERS:
         values: dict[str, Any] = {

@@ -1,10 +1,10 @@
-"""Model-based by least squares: a long VARX window fitted to the record is the state of a predictor, and the
-Riccati equation gives the gains.
+"""Model-based by least squares: a long VARX window is fitted to the record and serves as the state of a
+predictor. The Riccati equation then gives the gains.
 
 y(t) = Theta [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)] + theta_0 + e(t)
 
-Nothing is assumed about the order of the plant; noise costs little, because the long window averages it as a
-Kalman filter would (Chiuso 2007 on VARX and subspace methods).
+The order of the plant is not assumed. Noise costs little, because the long window averages it as a Kalman
+filter would (Chiuso 2007 on VARX and subspace methods).
 """
 
 from collections.abc import Sequence
@@ -20,8 +20,8 @@ from pipeline.temperature.tracking import Law, gains
 
 
 class WindowModel(NamedTuple):
-    """Theta (p, N (m+p)), theta_0 (p,), the innovation's covariance (p, p), and the table by which N was
-    chosen: (past, parameters, criterion) rows."""
+    """A VARX model: Theta (p, N (m+p)), theta_0 (p,), the covariance (p, p) of the innovation, and the table
+    from which N was chosen, with rows (past, parameters, criterion)."""
 
     Theta: np.ndarray
     theta_0: np.ndarray
@@ -39,14 +39,14 @@ def learn(
     offset: bool = False,
     gain_spread: float = 0.0,
 ) -> WindowModel:
-    """Least-squares VARX on segments u (T, m), y (T, p), its window N <= `longest` chosen by Akaike's
-    criterion on the samples that the longest one leaves.
+    """Fits a VARX model by least squares to segments u (T, m), y (T, p). Akaike's criterion chooses its
+    window N <= `longest`. All windows use the samples that are left for the longest one.
 
     One QR factorisation serves every N, because the columns are ordered lag by lag. With `gain_spread` sigma
-    the predictor is the best on average over plants whose columns of B differ by a random 1 + sigma: of such
-    a plant, (u / (1 + sigma), y) is a record too, so that the expected moments are those of the record plus
-    sigma^2 times each input's own. It then leans on measured y where a long memory of u would carry a wrong
-    gain along. Raises ValueError where the record is shorter than the shortest window needs.
+    the predictor is the best on average over plants whose columns of B differ by a random factor 1 + sigma.
+    For such a plant (u / (1 + sigma), y) is a record too, so the expected moments are those of the record
+    plus sigma^2 times each input's own. The predictor then relies on measured y where a long memory of u
+    would carry a wrong gain along. Raises ValueError if the record is shorter than the shortest window needs.
     """
     w, _, y_now = windows(u, y, longest)
     m, p = u[0].shape[1], y[0].shape[1]
@@ -94,8 +94,8 @@ def learn(
 
 
 def _triangle(columns: np.ndarray) -> np.ndarray:
-    """R of the QR factorisation: by Cholesky from the moments where those keep enough digits (a noisy
-    record), by Householder reflections otherwise."""
+    """Returns R of the QR factorisation: by Cholesky from the moments if they keep enough digits (a noisy
+    record), otherwise by Householder reflections."""
     size = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     size[size == 0] = 1.0
     factor, failed = scipy.linalg.lapack.dpotrf(
@@ -105,8 +105,8 @@ def _triangle(columns: np.ndarray) -> np.ndarray:
 
 
 def _own_moments(triangle: np.ndarray, offset: bool, m: int, p: int) -> np.ndarray:
-    """Rows whose squares sum to each input's own second moment over its lags, inputs
-    apart from one another; the outputs' columns stay 0."""
+    """Returns rows whose squares sum to each input's own second moment over its lags, without products of
+    different inputs. The columns of the outputs are 0."""
     k, rows = triangle.shape[1], []
     for channel in range(m):
         lags = np.arange(offset + channel, k, m + p)
@@ -119,8 +119,8 @@ def _own_moments(triangle: np.ndarray, offset: bool, m: int, p: int) -> np.ndarr
 def _criterion(
     triangle: np.ndarray, offset: bool, N: int, m: int, p: int, samples: int
 ) -> tuple[int, int, float]:
-    """Akaike's criterion of the window N, its residual read off the triangle; a residual below rounding
-    counts as rounding, so that the shortest exact N wins."""
+    """Returns (N, parameters, Akaike's criterion) of the window N, with its residual taken from the triangle.
+    A residual below rounding counts as rounding, so the shortest exact N wins."""
     k = offset + N * (m + p)
     rest, whole = triangle[k:, -p:], triangle[:, -p:]
     floor = 1e-20 * np.trace(whole.T @ whole) / samples
@@ -129,7 +129,8 @@ def _criterion(
 
 
 def predictor(window: WindowModel, sample_time_s: float = 1.0) -> Plant:
-    """The window as a plant in innovation form: x = w, A = shift + B_y Theta, B = B_u, C = Theta, K = B_y."""
+    """Returns the window as a plant in innovation form. The state is x = w, with A = shift + B_y Theta, B =
+    B_u, C = Theta, K = B_y."""
     p = len(window.Theta)
     A, B_u, B_y = window_shift(window.Theta.shape[1] // window.N - p, p, window.N)
     return make_plant(
@@ -144,10 +145,12 @@ def predictor(window: WindowModel, sample_time_s: float = 1.0) -> Plant:
 
 
 def observer_form(window: WindowModel, sample_time_s: float = 1.0) -> tuple[Plant, np.ndarray]:
-    """The same predictor with N p states instead of N (m+p), and T (N p, N (m+p)) with x = T w.
+    """Returns the same predictor with N p states instead of N (m+p), and T (N p, N (m+p)) with x = T w. This
+    is the observer canonical form of a VARX model (Kailath 1980, 2.1):
 
-    x_i(t) = sum_{l >= i} A_l y(t - l + i - 1) + B_l u(t - l + i - 1), y = x_1 + theta_0, so that
-    x_i(t+1) = A_i y + B_i u + x_{i+1}: the observer canonical form of a VARX model (Kailath 1980, 2.1).
+    x_i(t) = sum_{l >= i} A_l y(t - l + i - 1) + B_l u(t - l + i - 1)
+    y = x_1 + theta_0
+    x_i(t+1) = A_i y + B_i u + x_{i+1}
     """
     N, p = window.N, len(window.Theta)
     m = window.Theta.shape[1] // N - p
@@ -169,8 +172,8 @@ def observer_form(window: WindowModel, sample_time_s: float = 1.0) -> tuple[Plan
 
 
 def law(window: WindowModel, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral: float = 0.0) -> Law:
-    """Optimal tracking (3) of the predictor: u = -K w - K_r r - k on
-    the window of past inputs and outputs."""
+    """Returns the law of optimal tracking (3) with the predictor: u = -K w - K_r r - k on the window w of
+    past inputs and outputs. `Q` (p, p), `R` (m, m): weights; `gamma`: discount."""
     model, T = observer_form(window)
     K_x, K_r, k, _ = gains(model, Q, R, gamma)
     return window_law(K_x @ T, K_r, k, window.N, integral=integral)
@@ -184,14 +187,15 @@ def predicted_tuples(
     horizon: int = 2,
     offset: bool = False,
 ) -> Tuples:
-    """Tuples for Algorithm 2 whose state is not the noisy window but the
-    directions of it that predict the next `horizon` outputs.
+    """Returns tuples for Algorithm 2. Their state is not the noisy window but the directions of it that
+    predict the next `horizon` outputs.
 
     x-hat = features [w; 1], from the singular vectors of (observability matrix of the predictor) x (root of
     the window's second moment), as in subspace identification. x-hat is uncorrelated with the noise still to
-    come, so that the least squares of Algorithm 2 lose the bias that noise in the regressors causes. Kept are
-    directions that move the outputs by more than twice the innovation: the value of a weaker one cannot be
-    told from noise, and is not worth more.
+    come, so the least squares of Algorithm 2 lose the bias that noise in the regressors causes. Only
+    directions that move the outputs by more than twice the innovation are kept. The value of a weaker
+    direction cannot be told from noise, and is not larger than the noise. Raises ValueError if there is no
+    such direction.
     """
     w, u_now, y_now = windows(u, y, window.N)
     model = predictor(window)
@@ -225,7 +229,8 @@ def predicted_tuples(
 
 
 def stored(window: WindowModel) -> dict[str, tuple[np.ndarray, str, str]]:
-    """The window as named arrays with unit and meaning, for an artifact; `restored` reads them back."""
+    """Returns the window as named arrays with unit and meaning, for an artifact; `restored` reads them
+    back."""
     return {
         "Theta": (
             window.Theta,

@@ -1,4 +1,4 @@
-"""Feedback in a record: whether its inputs answer what its outputs did."""
+"""Feedback in a record: whether its inputs respond to past outputs."""
 
 from typing import NamedTuple
 
@@ -7,14 +7,14 @@ import scipy.stats
 
 from pipeline.temperature.identification.subspace import Segments, complete_runs, lagged, one_step
 
-LEVEL_CLOSED = 0.001  # of the test for feedback: far below 5 %, as records are less ideal than the test
-# rows that the test looks at, in stretches of so many: a row takes past (m + p) numbers
+LEVEL_CLOSED = 0.001  # of the test for feedback: far below 5 %, because records are not as ideal as the test
+# rows that the test uses at most, and rows of a stretch: a row takes past (m + p) numbers
 MOST, STRETCH = 40_000, 4_000
 
 
 class ClosedLoop(NamedTuple):
-    """Whether the inputs answer what the outputs did: p_value (m,) of each input, and `closed` where one of
-    them is below `LEVEL_CLOSED` shared among the inputs."""
+    """Whether the inputs respond to the outputs: p_value (m,) of each input; `closed` if one of them is below
+    `LEVEL_CLOSED` divided among the tests of the inputs."""
 
     p_value: np.ndarray
     closed: bool
@@ -23,14 +23,14 @@ class ClosedLoop(NamedTuple):
 def closed_loop(
     u: Segments, y: Segments, past: int, *, offset: bool = True, lags: int = 5, inputs: int | None = None
 ) -> ClosedLoop:
-    """Whether inputs follow innovations (Granger 1969): what the past of u does not foretell of u(t) is
-    regressed on one-step errors of VARX models, which are consistent with and without feedback.
+    """Tests whether inputs follow innovations (Granger 1969). The part of u(t) that the past of u does not
+    predict is regressed on one-step errors of VARX models, which are consistent with and without feedback.
 
-    Errors before t speak of feedback alone. The error at t correlates with u(t) under feed-through too, and
-    then by as much where an input jumps: a jump of a set-point moves u, and y only later. Of inputs set by a
-    plan the statistics are chi-squared, whatever the plan, as errors are white. Jumps are clipped: they would
-    drown the small answers to noise, by which feedback is recognised. Only the first `inputs` columns are
-    tested; of a record of more than MOST rows stretches that are spread evenly over it.
+    Errors before t show feedback alone. The error at t also correlates with u(t) under feed-through, and then
+    as strongly when an input jumps. A jump of a set-point moves u at once, but y only later. For inputs set
+    by any plan the statistics are chi-squared, because errors are white. Jumps are clipped: they would hide
+    the small responses to noise that show feedback. Only the first `inputs` columns are tested (all if None).
+    In a record of more than MOST rows, only stretches that are spread evenly over it are used.
     """
     answers = _answers(u, y, past, offset=offset, lags=lags)
     m = inputs or u[0].shape[1]
@@ -53,11 +53,11 @@ def closed_loop(
 def _answers(
     u: Segments, y: Segments, past: int, *, offset: bool, lags: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """What the past of the inputs does not foretell of them (N, m), beside one-step errors of the outputs at
-    lags 1..k (N, k p), of a predictor that knows u(t), and at lag 0 (N, p), of one that does not; None if no
-    stretch is long enough to tell."""
+    """Returns the part of the inputs that their past does not predict (N, m); one-step errors of the outputs
+    at lags 1..k (N, k p), of a predictor that knows u(t); and at lag 0 (N, p), of one that does not. Returns
+    None if no stretch is long enough."""
     m, runs = u[0].shape[1], [w for w in complete_runs(u, y) if len(w) > past + lags + 1]
-    # the predictor that is told u(t) has m unknowns more
+    # the predictor that knows u(t) has m unknowns more
     if sum(len(w) - past for w in runs) < (past + 1) * sum(part[0].shape[1] for part in (u, y)) + m + 1:
         return None
     data, untold = (lagged(u, y, past, feedthrough=told, offset=offset) for told in (True, False))
@@ -68,7 +68,7 @@ def _answers(
         now_u, now_y = w[past:, :m] - data.means[0, :m], w[past:, m:] - data.means[0, m:]
         told = now_y - np.hstack([now_u, z]) @ of_told
         parts[0].append(w[past + lags :, :m])
-        # as recorded: an input that is held has moved by nothing, to the last bit
+        # as recorded, so that the change of a constant input is exactly zero
         late = [w[past + lags - lag : len(w) - lag, :m] for lag in range(1, min(past, 20) + 1)]
         parts[1].append(np.stack(late, axis=1))
         parts[2].append(np.hstack([told[lags - k : len(told) - k] for k in range(1, lags + 1)]))
@@ -78,7 +78,7 @@ def _answers(
 
 
 def _spread(runs: list[np.ndarray], fewest: int) -> list[np.ndarray]:
-    """The runs, or stretches of them that together have at most about MOST rows, each more than `fewest`."""
+    """Returns the runs, or stretches of them with about MOST rows in total, each longer than `fewest`."""
     rows = sum(len(w) for w in runs)
     if rows <= MOST:
         return runs
@@ -88,8 +88,8 @@ def _spread(runs: list[np.ndarray], fewest: int) -> list[np.ndarray]:
 
 
 def _unforeseen(now: np.ndarray, history: np.ndarray) -> np.ndarray:
-    """What the past of all inputs (N, past, m) does not foretell of each (N, m): by regression, or by its
-    last value where that is nearer in the median."""
+    """Returns the part of each input (N, m) that the past of all inputs (N, past, m) does not predict. The
+    prediction is by regression, or is the input's last value if that is nearer in the median."""
     centred = history.reshape(len(now), -1) - history.reshape(len(now), -1).mean(axis=0)
     design = np.hstack([np.ones((len(now), 1)), centred])
     by_regression = now - design @ np.linalg.lstsq(design, now, rcond=1e-10)[0]
@@ -100,14 +100,15 @@ def _unforeseen(now: np.ndarray, history: np.ndarray) -> np.ndarray:
 
 
 def _clipped(moved: np.ndarray) -> np.ndarray:
-    """At three robust deviations of its usual size; of an input that is held, of the sizes of its moves."""
+    """Clips values at three robust standard deviations, 4.5 times their median size. For an input that is
+    mostly constant, the median of its changes is used."""
     size = np.abs(moved)
     scale = np.median(size) or (np.median(size[size > 0]) if size.any() else 0.0)
     return np.clip(moved, -4.5 * scale, 4.5 * scale)
 
 
 def _p_value(moved: np.ndarray, errors: np.ndarray) -> float:
-    """Of no correlation of moved (N,) with any column of errors (N, k)."""
+    """Returns the p-value of no correlation of moved (N,) with any column of errors (N, k)."""
     design = np.hstack([np.ones((len(errors), 1)), errors])
     answered = design @ np.linalg.lstsq(design, moved, rcond=1e-10)[0]
     share = np.var(answered) / max(np.var(moved), np.finfo(float).tiny)
@@ -115,8 +116,8 @@ def _p_value(moved: np.ndarray, errors: np.ndarray) -> float:
 
 
 def _jumps_with(errors: np.ndarray, excess: np.ndarray) -> bool:
-    """Whether outputs answer the large moves of an input at once, or it makes none that could tell:
-    feed-through then explains what a correlation at lag 0 shows."""
+    """Returns True if outputs respond at once to the large moves of an input, or if it makes too few to tell.
+    Feed-through then explains a correlation at lag 0."""
     if np.count_nonzero(excess) < 4:
         return True
     about_mean = excess - excess.mean()

@@ -1,13 +1,19 @@
-"""Slow drift: what is not recorded (ambient, operating point) as a random walk beside each output.
+"""Slow drift: unrecorded influences (ambient, operating point) as a random walk beside each output.
 
-y(t) = ŷ(t) + w(t) + e(t), w(t+1) = w(t) + v(t), with ŷ the simulation of the plant under its inputs alone:
-the disturbance model of output steps (Cutler and Ramaker 1980; Muske and Badgwell 2002, section 3.1). The
-Kalman filter of a random walk in white noise is exponential smoothing (Muth 1960), w(t+1) = w(t) + k(t) (y(t)
-- ŷ(t) - w(t)), where k(t) = 1/(t+1) until it reaches the `rate`: the mean over a warm-up of 1/rate samples,
-then slow tracking. Stable for every rate in (0, 1], whatever the plant.
+y(t) = ŷ(t) + w(t) + e(t)
+w(t+1) = w(t) + v(t)
 
-It is for forecasts and hold-outs at another ambient. Controllers do not get this state: theirs are free of
-offset by their integrator.
+ŷ is the simulation of the plant under its inputs alone. This is the disturbance model of output steps (Cutler
+and Ramaker 1980; Muske and Badgwell 2002, section 3.1). The Kalman filter of a random walk in white noise is
+exponential smoothing (Muth 1960):
+
+w(t+1) = w(t) + k(t) (y(t) - ŷ(t) - w(t))
+
+k(t) = 1/(t+1) until it reaches the `rate`: the mean over a warm-up of 1/rate samples, then slow tracking. It
+is stable for every rate in (0, 1] and every plant.
+
+It serves forecasts and hold-outs at another ambient. Controllers do not get this state: their integrator
+removes offsets.
 """
 
 import numpy as np
@@ -27,14 +33,14 @@ from pipeline.temperature.identification.refinement import FitSettings, simulate
 from pipeline.temperature.identification.subspace import Segments, lagged, realise, subspace
 from pipeline.temperature.plant import Plant
 
-SLOWER = (1, 4, 16)  # time constants of a drift that are tried, in windows
-# a mode so near an integrator moves the level itself: beside it a drift is not observable
+SLOWER = (1, 4, 16)  # tried time constants of a drift, in windows
+# a mode this near to an integrator moves the level itself, so a drift beside it is not observable
 INTEGRATES = 1e-4
 
 
 def tracked(error: np.ndarray, rate: float, ahead: int = 1) -> np.ndarray:
-    """w(t | errors up to t - ahead) (T, p) of simulation errors (T, p); NaN before the first and where none
-    has been seen, and a masked error leaves w as it is."""
+    """Returns w(t | errors up to t - ahead) (T, p) of simulation errors (T, p). NaN before an output's first
+    error is known; a masked error leaves w unchanged."""
     level, count = np.full(error.shape[1], np.nan), np.zeros(error.shape[1])
     drift = np.full(error.shape, np.nan)
     for t in range(len(error) - ahead):
@@ -50,10 +56,11 @@ def tracked(error: np.ndarray, rate: float, ahead: int = 1) -> np.ndarray:
 def chosen_rate(
     u: Segments, y: Segments, structure: ModelStructure, order: int, kind: Fit, validation: Validation
 ) -> float:
-    """The rate of the drift, 0 for none: of `SLOWER` the one with the least error a window ahead on the
-    left-out blocks or recordings, where it takes `WORTH_REFINING` off the error without it, beyond chance.
+    """Returns the rate of the drift, 0 for none. Of `SLOWER` it takes the one with the least error one window
+    ahead on the left-out blocks or recordings, if it lowers the error without drift by more than
+    `WORTH_REFINING`, beyond chance.
 
-    None of a plant with an integrator, and where blocks are shorter than four windows or leave too little.
+    Returns 0 for a plant with an integrator, and if blocks are shorter than four windows or leave too little.
     """
     u, y = shifted(u, y, structure.delays)
     direct, settings = (
@@ -66,7 +73,7 @@ def chosen_rate(
             return 0.0
         try:
             data = lagged(train_u, train_y, structure.past, feedthrough=direct, offset=structure.offset)
-        except ValueError:  # what is left of the record is too short
+        except ValueError:  # the rest of the record is too short
             return 0.0
         start = realise(data, subspace(data, structure.past)[0][:order], 1.0, structure.feedthrough)
         plant = fit(kind, start, train_u, train_y, settings, gain=False)
@@ -82,8 +89,8 @@ def chosen_rate(
 
 
 def _errors_ahead(plant: Plant, u: Segments, y: Segments, past: int) -> list[float]:
-    """Size of the error a window ahead as a share of the outputs' variation, without drift and with each of
-    `SLOWER`, after two windows of warm-up."""
+    """Returns the size of the error one window ahead as a share of the outputs' variation, without drift and
+    with each of `SLOWER`, after two windows of warm-up."""
     left, spread = [[] for _ in range(1 + len(SLOWER))], np.nanstd(np.vstack(y), axis=0)
     for a, b in zip(u, y, strict=True):
         if len(a) < 4 * past:
@@ -99,8 +106,8 @@ def _errors_ahead(plant: Plant, u: Segments, y: Segments, past: int) -> list[flo
 
 
 def simulated_with_drift(plant: Plant, u: np.ndarray, y: np.ndarray, rate: float, ahead: int) -> np.ndarray:
-    """ŷ(t) + w(t | y up to t - ahead) (T, p); NaN over the warm-up of 1/rate samples, or a third of the
-    segment where that is shorter, and `ahead` more."""
+    """Returns ŷ(t) + w(t | y up to t - ahead) (T, p). NaN over the warm-up of 1/rate samples, or a third of
+    the segment if that is shorter, and `ahead` more."""
     # the drift has the mean of the error
     error = y - simulated(plant, u, y, means_removed=True)
     predicted = y - error + tracked(error, rate, ahead)

@@ -1,5 +1,5 @@
-"""First-order models with delay, K e^(-theta s) / (tau s + 1), from records and from single steps up and
-down; for the extruder and for one heater alike."""
+"""First-order models with delay, K e^(-theta s) / (tau s + 1), from records and from step responses, for the
+extruder and for one heater."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,16 +12,16 @@ import scipy.signal
 def simc_pid(
     gain: float, time_constant_s: float, delay_s: float, *, sample_time_s: float
 ) -> tuple[float, float, float]:
-    """Kp (units of u by units of y), Ki (by second) and Kd (seconds) of u = Kp e + Ki integral of e + Kd
-    de/dt: SIMC for a first-order model with delay, a third of the delay as derivative time (Grimholt and
-    Skogestad 2018, iSIMC), series form rewritten as parallel:
+    """Returns Kp (units of u per unit of y), Ki (per second) and Kd (seconds) of u = Kp e + Ki integral of e
+    + Kd de/dt, by SIMC for a first-order model with delay. A third of the delay is the derivative time
+    (Grimholt and Skogestad 2018, iSIMC); the series form is rewritten as parallel:
 
     K_c = tau / (K (tau_c + theta))
     tau_I = min(tau, 4 (tau_c + theta))
     tau_D = theta / 3
     tau_c = theta
 
-    The delay counts half a sample more, by which a held input is late, and as no less than one sample.
+    theta is the delay plus half a sample, because a held input is late by that, and at least one sample.
     """
     theta = max(delay_s + sample_time_s / 2, sample_time_s)
     tau = max(time_constant_s, sample_time_s)
@@ -31,7 +31,7 @@ def simc_pid(
 
 class StepModels(NamedTuple):
     """First-order models of step responses, each (...): gain, time constant and delay in samples, and the
-    NRMSE in percent of the model beside the response, 100 for a response of one such mode."""
+    NRMSE fit in percent of the model to the response, 100 for an exact first-order response."""
 
     gain: np.ndarray
     time_constant: np.ndarray
@@ -42,11 +42,11 @@ class StepModels(NamedTuple):
 def of_step_responses(
     t: np.ndarray, responses: np.ndarray, *, taus: int = 90, delays: int = 40
 ) -> StepModels:
-    """K (1 - exp(-(t - theta) / tau)) nearest in least squares to each response (T, ...) at samples t (T,).
+    """Fits K (1 - exp(-(t - theta) / tau)) by least squares to each response (T, ...) at samples t (T,).
 
-    tau and theta are sought on one grid for all: tau from half a sample to three times the horizon, in equal
-    ratios of some tenth; theta up to a third of the horizon, closer together where it is short. K is the best
-    for each; among equals the model without delay wins.
+    tau and theta are searched on one grid for all responses: tau from half a sample to three times the
+    horizon, in equal ratios of about a tenth; theta up to a third of the horizon, with smaller steps at small
+    values. K is the best for each. Among equals the model without delay wins.
     """
     horizon = float(t[-1])
     tau = np.geomspace(0.5, 3 * horizon, taus)
@@ -67,10 +67,11 @@ def of_step_responses(
 
 
 def response(u: np.ndarray, time_constant_s: float, delay_s: float, sample_time_s: float) -> np.ndarray:
-    """Unit-gain response (T,) from rest to u (T,) held between samples, u(0) held for ever
-    before: exact for any delay, whole samples or not.
+    """Returns the unit-gain response (T,) from rest to u (T,) held between samples. Before the start the
+    input was always u(0). Exact for any delay, whole samples or not:
 
     x(t+1) = a x(t) + (1 - c) u(t-k) + (c - a) u(t-k-1)
+
     with delay = (k + f) samples, a = exp(-Ts/tau), c = exp(-(1-f) Ts/tau).
     """
     whole, fraction = divmod(delay_s / sample_time_s, 1.0)
@@ -84,17 +85,17 @@ def response(u: np.ndarray, time_constant_s: float, delay_s: float, sample_time_
     return scipy.signal.lfilter([0.0, 1.0 - c, c - a], [1.0, -a], late)
 
 
-# the constants that are tried, as shares of the sample time and of the record
+# number of time constants tried, from one sample time to twice the longest segment
 _GRID = 40
 MOST_SAMPLES = 3000
 
 
 def time_constant(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float) -> float:
-    """The tau in seconds for which y = sum_i K_i u_i / (tau s + 1) + y(0) e^(-t/tau) + offset simulates the
-    segments u (T, m), y (T,) best.
+    """Returns the tau in seconds for which y = sum_i K_i u_i / (tau s + 1) + y(0) e^(-t/tau) + offset
+    simulates the segments u (T, m), y (T,) best.
 
-    NaN in y is a masked sample. Long records are thinned to MOST_SAMPLES. Raises ValueError where no input
-    moves or fewer than 20 samples are seen.
+    NaN in y is a masked sample. Long records are thinned to MOST_SAMPLES. Raises ValueError if no input moves
+    or fewer than 20 samples are measured.
     """
     thin = max(1, sum(map(len, y)) // MOST_SAMPLES)
     u, y = [np.asarray(a, float)[::thin] for a in u], [np.asarray(b, float)[::thin] for b in y]
@@ -112,7 +113,7 @@ def time_constant(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_ti
 
 
 def _error(pairs: Sequence[tuple[np.ndarray, np.ndarray]], tau: float, sample_time_s: float) -> float:
-    """Sum of squares of the best simulation with this time constant."""
+    """Returns the sum of squared errors of the best simulation with this time constant."""
     m, rows, target = pairs[0][0].shape[1], [], []
     for s, (a, b) in enumerate(pairs):
         block = np.zeros((len(b), m + 1 + len(pairs)))

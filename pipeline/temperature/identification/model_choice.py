@@ -1,28 +1,29 @@
-"""From a record to a plant. Stated rules choose window, dead time, feed-through, order and refinement
-together, on what is left out of the identification data: blocks, or whole recordings where there are several.
-Then one fit is made on all of it.
+"""Chooses a plant model from a record. Stated rules choose window, dead time, feed-through, order and
+refinement together. Candidates are compared on data left out of the identification: blocks, or whole
+recordings if there are several. The chosen model is then fitted once to all of the record.
 
-The rules, each with its reason:
+The rules, with their reasons:
 
 window: Twice the lags of Akaike's criterion (corrected for few samples) over VARX models, long enough to
-    whiten. Schwarz's lags beside them, for records that say little, and a window that spans the slowest mode
-    that the longest shows, where that is longer by half.
-closed loop: Recognised by `closed_loop`. PBSID and prediction-error fits stay consistent there; fits to
-    simulated outputs do not, and are not tried. Candidates are judged one step ahead too.
-feed-through: With and without u(t) in the outputs whose one-step predictor Schwarz's criterion prefers with
-    it, where `feedthrough` is None. None in closed loop: a row of D would be the controller's inverse.
-drift: What wanders and is not recorded becomes a state that hardly decays, with the rest of the order; and a
-    random walk beside each output (`drift`), for forecasts, where the left-out blocks prefer it.
-largest order: The singular values, in units of the noise, above what coefficient errors alone reach:
-    sqrt(2) (sqrt(rows) + sqrt(columns)) of the noise matrix.
-dead time: None; the lags at which the largest model's impulse response stays under 5 % of its peak; those
-    under a quarter of it that Wald's test finds silent too.
+    whiten the errors. Schwarz's lags are tried too, for records with little information. So is a window that
+    spans the slowest mode of the longest one's model, if it is at least 1.5 times as long.
+closed loop: Detected by `closed_loop`. PBSID and prediction-error fits stay consistent there. Fits to
+    simulated outputs do not, so they are not tried. Candidates are also judged one step ahead.
+feed-through: If `feedthrough` is None, models with and without u(t) are tried for the outputs whose one-step
+    predictor is better with u(t) by Schwarz's criterion. In closed loop there is no feed-through, because a
+    row of D would be the controller's inverse.
+drift: Unrecorded slow changes become a state that hardly decays, identified with the rest of the order. For
+    forecasts, a random walk is added to each output (`drift`) if the left-out blocks prefer it.
+largest order: The number of singular values, in units of the noise, above the level that coefficient errors
+    alone reach: sqrt(2) (sqrt(rows) + sqrt(columns)) of the noise matrix.
+dead time: Three candidates: none; the lags at which the largest model's impulse response stays under 5 % of
+    its peak; and the lags under 25 % of the peak that Wald's test finds silent too.
 order: The fewest parameters whose error is within 2 % of the best. The error is that of
     simulating left-out blocks (geometric mean).
-refinement: Where `refinement` is "validated", prediction-error fits of the best candidate of each structure.
-    One is taken where it takes more than 5 % off the error on the left-out blocks, and beyond chance
-    (Student's t) off the error about their means; one for simulation only where it beats prediction by a
-    fifth.
+refinement: If `refinement` is "validated", the best candidates of the structures are refined by
+    prediction-error fits. A refined fit is taken if it lowers the error on the left-out blocks by more than
+    5 %, and the error about their means beyond chance (Student's t). A fit to simulated outputs is taken
+    only if its error is at least a fifth below that of the fit to one-step predictions.
 """
 
 from collections.abc import Sequence
@@ -74,13 +75,12 @@ EXACT_RANK = 1e-7  # singular values of a noise-free record below this share of 
 
 
 class Identified(NamedTuple):
-    """An identified plant and how it was chosen. order: states without those of the delays; past: window;
-    order_table: candidates with their errors.
+    """An identified plant and how it was chosen. order: states without those of the delays; past: window in
+    samples; order_table: candidates with their errors.
 
-    delays are the dead times in the plant, in samples for each input; silent marks inputs that no output
-    answers, feedthrough the outputs with a row of D. drift is the rate of a random walk beside the outputs, a
-    sample, 0 for none. x0 has the initial state of each segment, or of each
-    piece where masked inputs cut one (`gapless`).
+    delays: dead times in the plant, in samples for each input; silent: inputs that no output answers;
+    feedthrough: outputs with a row of D. drift: rate per sample of a random walk beside the outputs, 0 for
+    none. x0: initial state of each segment, or of each piece if masked inputs cut a segment (`gapless`).
     """
 
     plant: Plant
@@ -100,16 +100,16 @@ class Identified(NamedTuple):
     notes: list[str]
     feedback: ClosedLoop | None = None
     drift: float = 0.0
-    reasons: tuple[str, ...] = ()  # of the choice, among the notes
+    reasons: tuple[str, ...] = ()  # notes on the choice; they are among `notes` too
 
 
 class Settings(NamedTuple):
-    """What is given and what is chosen. None leaves order, window `past` and feed-through to the data.
+    """The settings of `identify`. None leaves order, window `past` and feed-through to the data.
 
-    `refinement` "prediction" or "simulation" moves the plant to the least errors of that kind. "validated"
-    does so only where the left-out `blocks` prefer it. `recordings` labels
-    the segments: of several recordings, whole ones are left out. The first `inputs` columns of u are moved by
-    people or controllers, all where None; the others are measured disturbances.
+    `refinement` "prediction" or "simulation" refines the plant to the smallest errors of that kind.
+    "validated" does so only if the left-out `blocks` prefer it. `recordings` labels the segments: if there
+    are several recordings, whole ones are left out. The first `inputs` columns of u are moved by people or
+    controllers (all columns if None); the others are measured disturbances.
     """
 
     order: int | None = None
@@ -127,8 +127,8 @@ DEFAULTS = Settings()
 
 
 class ModelChoice(NamedTuple):
-    """The class of model that one fit on all of the record is made of; `exact`: the record is noise-free;
-    `table`: the candidates that were compared."""
+    """The model class of the one fit to all of the record. `exact`: the record is noise-free; `table`: the
+    candidates that were compared."""
 
     structure: ModelStructure
     order: int
@@ -142,7 +142,7 @@ def name_of(names: Sequence[str], letter: str, j: int) -> str:
 
 
 def check_outputs(y: Segments, *, names: Sequence[str] = ()) -> None:
-    """Raises ValueError where an output never moves: no model of it is possible."""
+    """Raises ValueError if an output never changes, because no model of it is possible."""
     rows = np.vstack(y)
     for j in range(rows.shape[1]):
         values = rows[np.isfinite(rows[:, j]), j]
@@ -155,8 +155,8 @@ def check_outputs(y: Segments, *, names: Sequence[str] = ()) -> None:
 
 
 def check_inputs(u: Segments, *, offset: bool = True, names: Sequence[str] = ()) -> None:
-    """Raises ValueError where an input is constant or a linear combination of the
-    others: its column of B is then not identified."""
+    """Raises ValueError if no sample has all inputs, or if an input is constant or a linear combination of
+    the others: its column of B is then not identified."""
     rows = np.vstack(u)
     rows = rows[np.isfinite(rows).all(axis=1)]
     if not len(rows):
@@ -187,12 +187,12 @@ def check_inputs(u: Segments, *, offset: bool = True, names: Sequence[str] = ())
 def within_limits(
     u: Segments, limits: tuple[Sequence[float], Sequence[float]], *, names: Sequence[str] = ()
 ) -> tuple[list[np.ndarray], list[str]]:
-    """The inputs that the actuators could follow, min(max(u, low), high), and a
-    sentence for each input that was asked beyond its limits by more than a millionth of their range, which is
-    rounding of a scale.
+    """Returns the inputs that the actuators could follow, min(max(u, low), high), and a sentence for each
+    input whose commands exceed its limits by more than a millionth of their range. Less than that is rounding
+    of a scale.
 
-    Clipping at a known limit loses nothing; masking the same samples would cut
-    the record wherever the actuator stands at its stop.
+    Clipping at a known limit loses nothing. Masking the same samples would cut the record wherever the
+    actuator is at its limit.
     """
     (low, high), notes = (np.asarray(side, float) for side in limits), []
     rows, rounding = np.vstack(u), 1e-6 * (high - low)
@@ -214,12 +214,12 @@ def identify(
     settings: Settings = DEFAULTS,
     names: Sequence[str] = (),
 ) -> Identified:
-    """The plant that a record shows, by the rules at the head of this module; u segments (T, m), y segments
-    (T, p), NaN where a sample is masked.
+    """Identifies the plant from a record, by the rules at the head of this module. `u`: segments (T, m); `y`:
+    segments (T, p); a masked sample is NaN.
 
-    PBSID makes the start, in innovation form. Works in closed loop, unless refined on simulation errors.
-    Raises ValueError for a constant or collinear input, a constant output, and a record too short for the
-    order.
+    Starts with PBSID, in innovation form. It works in closed loop, unless the plant is refined on simulation
+    errors. Raises ValueError if an input is constant or collinear, an output is constant, or the record is
+    too short for the order.
     """
     u, y, recordings, cut = _prepared(u, y, settings, names)
     choice, reasons, validation, feedback = _chosen(u, y, recordings, settings)
@@ -232,8 +232,8 @@ def identify(
 
 
 def refit(u: Segments, y: Segments, identified: Identified, *, names: Sequence[str] = ()) -> Identified:
-    """What was chosen on a part of the record (window, feed-through, dead times, order, refinement) fitted to
-    all of it, nothing chosen anew; as `identify` otherwise."""
+    """Fits the model chosen on a part of the record (window, feed-through, dead times, order, refinement) to
+    all of it. Chooses nothing anew. Otherwise like `identify`."""
     past, offset, table = identified.past, identified.offset, identified.order_table
     settings = Settings(order=identified.order, past=past, offset=offset)
     u, y, _, cut = _prepared(u, y, settings, names)
@@ -249,8 +249,8 @@ def refit(u: Segments, y: Segments, identified: Identified, *, names: Sequence[s
 def _prepared(
     u: Segments, y: Segments, settings: Settings, names: Sequence[str]
 ) -> tuple[list[np.ndarray], list[np.ndarray], tuple[int, ...], int]:
-    """The record as it can be identified, checked: cut at masked inputs; the recording of each piece, and how
-    many samples were left out."""
+    """Returns the record u, y, checked and cut at masked inputs; the recording of each piece; and how many
+    samples were left out."""
     u, y = [np.atleast_2d(np.asarray(a, float)) for a in u], [np.atleast_2d(np.asarray(b, float)) for b in y]
     samples = sum(map(len, u))
     pieces = [gapless([a], [b]) for a, b in zip(u, y, strict=True)]
@@ -267,15 +267,15 @@ def _prepared(
 def _chosen(
     u: Segments, y: Segments, recordings: tuple[int, ...], settings: Settings
 ) -> tuple[ModelChoice, list[str], Validation, ClosedLoop | None]:
-    """What the rules choose, a sentence for each choice that a user should know of, how candidates were
-    judged, and whether the inputs answer the outputs (None of a noise-free record)."""
+    """Returns the choice made by the rules; a sentence for each choice that a user should know; how
+    candidates were judged; and whether the inputs respond to the outputs (None for a noise-free record)."""
     pasts, exact = _windows(u, y, settings.order, settings.past, settings.offset)
     none = (False,) * y[0].shape[1]
     feedback = None if exact else closed_loop(u, y, pasts[0], offset=settings.offset, inputs=settings.inputs)
     closed = feedback is not None and feedback.closed
     direct = [(bool(settings.feedthrough),) * len(none)]
     if settings.feedthrough is None:
-        # under feedback, u(t) holds what noise did to y(t): a row of D would be the controller's inverse
+        # under feedback, u(t) contains the noise of y(t), so a row of D would be the controller's inverse
         shows = none if closed else feedthrough_shows(u, y, pasts[0], settings.offset)
         direct = [none, shows] if any(shows) else [none]
     structure = ModelStructure(pasts[0], direct[-1], settings.offset, (0,) * u[0].shape[1])
@@ -284,7 +284,7 @@ def _chosen(
     )
     validated, notes = settings.refinement == "validated", []
     validation = Validation(settings.blocks, recordings, closed)
-    # a rank beyond max_order is a nonlinearity without noise: the order is then a choice, as with noise
+    # a rank beyond max_order shows a nonlinearity without noise; the order is then chosen as with noise
     if exact and (rank := _exact_rank(u, y, structure)) <= settings.max_order:
         notes.append(
             f"the record is noise-free: {pasts[0]} past samples predict it to rounding, "
@@ -300,7 +300,7 @@ def _chosen(
 
 
 def _reasons(choice: ModelChoice, direct: list[tuple[bool, ...]], closed: bool) -> list[str]:
-    """A sentence for feed-through and feedback, where the record raises the question."""
+    """Returns a sentence on feed-through and one on feedback, if the record raises the question."""
     notes = []
     if len(direct) > 1:
         rows = sum(choice.structure.feedthrough)
@@ -316,7 +316,7 @@ def _reasons(choice: ModelChoice, direct: list[tuple[bool, ...]], closed: bool) 
 
 
 def _exact_rank(u: Segments, y: Segments, structure: ModelStructure) -> int:
-    """The order of a noise-free record: singular values that are more than rounding, at least 1."""
+    """Returns the order of a noise-free record: the number of singular values above rounding, at least 1."""
     data = lagged(
         u, y, structure.past, feedthrough=any(structure.feedthrough), offset=structure.offset, exact=True
     )
@@ -325,11 +325,12 @@ def _exact_rank(u: Segments, y: Segments, structure: ModelStructure) -> int:
 
 
 def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
-    """The windows to try, each long enough for the order asked, and whether the record is noise-free."""
+    """Returns the windows to try, each long enough for the requested order, and whether the record is
+    noise-free."""
     if past:
         return (past,), False
     longest = longest_window(u, y)
-    # a few lags tell whether the record is noise-free
+    # a few lags may already show that the record is noise-free
     pasts, exact = windows(lagged(u, y, min(longest, 6), offset=offset))
     if not exact:
         pasts, exact = windows(lagged(u, y, longest, offset=offset))
@@ -340,8 +341,8 @@ def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
 def _best_candidate(
     u: Segments, y: Segments, structures: list[ModelStructure], settings: Settings, validation: Validation
 ) -> tuple[OrderCandidate, list[OrderCandidate]]:
-    """The candidate that the rules take, and the table: structures and orders of the subspace fit, then
-    refined fits of the best candidate of each structure, as many as `WORK` allows."""
+    """Returns the candidate that the rules choose, and the table: structures and orders of the subspace fit,
+    then refined fits of the best candidate of each structure, as many as `WORK` allows."""
     singular_values, table = {}, []
     structures = _with_slow_window(u, y, structures, settings)
     for structure in structures:
@@ -355,7 +356,7 @@ def _best_candidate(
                 u, y, orders, delayed, ("subspace",), singular_values=values, validation=validation
             )
     if not table and validation.recordings:
-        # what is left without one recording is too short: blocks of every recording instead
+        # the record without one recording is too short, so blocks of every recording are used instead
         return _best_candidate(u, y, structures, settings, validation._replace(recordings=()))
     if not table:
         raise ValueError(
@@ -365,14 +366,14 @@ def _best_candidate(
         )
     if settings.refinement != "validated":
         return simplest(table), table
-    # a fit to simulated outputs takes what feedback put into u for an effect of u
+    # a fit to simulated outputs would mistake feedback in u for an effect of u
     kinds: tuple[Fit, ...] = ("prediction",) if validation.closed else ("prediction", "simulation")
     entrants = []
     for start in _shortlist(u, table):
         values = singular_values[start.structure.past, start.structure.feedthrough]
         refined: list[OrderCandidate] = []
         for kind in kinds:
-            # on a long record the fit that may only win by a fifth is tried where the other gains nothing
+            # on a long record the second fit, which must win by a fifth, is tried if the first is no gain
             if refined and _work(u, start) > WORK / 20 and _better_fit(start, refined) is not start:
                 break
             refined += cross_validate(
@@ -386,8 +387,9 @@ def _best_candidate(
 def _with_slow_window(
     u: Segments, y: Segments, structures: list[ModelStructure], settings: Settings
 ) -> list[ModelStructure]:
-    """The structures, and the longest of them with a window that spans the slowest mode that it shows, where
-    that is longer by half: criteria of one step ahead stop where a slow mode still gains them nothing."""
+    """Returns the structures, and copies with a window that spans the slowest mode of the longest structure's
+    model, if that window is at least 1.5 times as long. One-step criteria stop at a window beyond which a
+    slow mode gains them nothing."""
     first = max(structures, key=lambda structure: structure.past)
     if settings.past:
         return structures
@@ -403,8 +405,8 @@ def _with_slow_window(
 
 
 def _shortlist(u: Segments, table: list[OrderCandidate]) -> list[OrderCandidate]:
-    """The best candidate of each structure, the best first: as many as `WORK` allows, at least one, and none
-    whose error is more than half above the best's."""
+    """Returns the best candidate of each structure, the best one first: as many as `WORK` allows, but at
+    least one. Candidates whose error is 1.5 times the lowest or more are left out."""
     of: dict[ModelStructure, list[OrderCandidate]] = {}
     for row in table:
         of.setdefault(row.structure, []).append(row)
@@ -421,12 +423,12 @@ def _shortlist(u: Segments, table: list[OrderCandidate]) -> list[OrderCandidate]
 
 
 def _work(u: Segments, row: OrderCandidate) -> float:
-    """What one step of refinement costs, in products."""
+    """Returns the cost of one step of refinement, in multiplications."""
     return float(sum(map(len, u))) * (row.order * (row.order + u[0].shape[1])) ** 2
 
 
 def _better_fit(start: OrderCandidate, refined: list[OrderCandidate]) -> OrderCandidate:
-    """The subspace candidate, or its best refined fit among those worth their cost."""
+    """Returns the subspace candidate, or the best of its refined fits that are worth their cost."""
     return min(
         (row for row in refined if worth_refining(start, row)),
         key=lambda row: row.error * (1 - WORTH_THE_NOISE) ** (row.fit == "prediction"),
@@ -437,7 +439,8 @@ def _better_fit(start: OrderCandidate, refined: list[OrderCandidate]) -> OrderCa
 def _candidates(
     data: Lagged, basis: np.ndarray, values: np.ndarray, structure: ModelStructure, settings: Settings
 ) -> tuple[Sequence[int], set[tuple[int, ...]]]:
-    """Orders and dead times worth trying: those asked for, or those that stand out of the noise."""
+    """Returns orders and dead times worth trying: the requested order, or those that stand out of the
+    noise."""
     delays = {structure.delays}
     if settings.order is not None:
         return [settings.order], delays
@@ -450,7 +453,7 @@ def _candidates(
 
 
 def _fit_all(u: Segments, y: Segments, choice: ModelChoice, sample_time_s: float) -> Identified:
-    """One fit of the chosen model on all of the record."""
+    """Fits the chosen model once to all of the record."""
     structure, order, kind, exact, table = choice
     past, settings = structure.past, FitSettings(structure.feedthrough, structure.offset, max_iterations=30)
     us, ys = shifted(u, y, structure.delays)
@@ -484,7 +487,7 @@ def _fit_all(u: Segments, y: Segments, choice: ModelChoice, sample_time_s: float
 
 
 def _remarked(fitted: Identified, cut: int, names: Sequence[str]) -> Identified:
-    """The fit with what a user should know of it, a sentence each; `cut` samples were left out."""
+    """Returns the fit with a sentence for each thing that a user should know; `cut` samples were left out."""
     remark = f"{cut} samples with a masked input, or without any output, were cut out"
     notes = [*([remark] if cut else []), *fitted.reasons]
     if fitted.dropped_rows:
@@ -520,8 +523,8 @@ def _remarked(fitted: Identified, cut: int, names: Sequence[str]) -> Identified:
 
 
 def _check_length(u: Segments, y: Segments, order: int | None, past: int | None) -> None:
-    """Six complete samples for each unknown of the smallest window that carries the order, and as many
-    unbroken windows as there are unknowns."""
+    """Checks for six complete samples per unknown of the smallest window that carries the order, and for as
+    many unbroken windows as unknowns. Raises ValueError if there are fewer."""
     if not u:
         raise ValueError(
             "the record is empty: no sample has all inputs beside at least one output; check the mapping, "
@@ -547,8 +550,8 @@ def _check_length(u: Segments, y: Segments, order: int | None, past: int | None)
 
 
 def rows(identified: Identified) -> dict[str, list]:
-    """The table by which the order was chosen, as columns: every candidate,
-    or the singular values alone where they decided."""
+    """Returns the table from which the order was chosen, as columns: every candidate, or only the singular
+    values if they decided."""
     structure = ModelStructure(identified.past, identified.feedthrough, identified.offset, identified.delays)
     shown_rows = [row for row in identified.order_table if row.structure == structure]
     tried = {

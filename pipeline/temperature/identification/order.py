@@ -1,5 +1,6 @@
-"""Which window, feed-through, dead time, order and fit: criteria propose, then every candidate is identified
-without one block of the record and simulated on it (cross-validation), and the simplest good one wins."""
+"""Chooses window, feed-through, dead time, order and fit. Criteria propose candidates. Every candidate is
+identified without one block of the record and simulated on it (cross-validation). The simplest good one is
+chosen."""
 
 from typing import Literal, NamedTuple
 
@@ -33,29 +34,29 @@ from pipeline.temperature.plant import Plant, clip_spectral_radius, markov_param
 from pipeline.temperature.plant import plant as make_plant
 
 Fit = Literal["subspace", "prediction", "simulation"]
-NOISE_FREE = 1e-10  # share of the outputs' power that a noise-free record's one-step errors stay under
+NOISE_FREE = 1e-10  # share of the outputs' power: a record with smaller one-step errors is noise-free
 WIDEST = 360  # columns of the lagged record: the cost of a fit grows with their square
-# a refined fit must take this share off the error: its own cost of computing and of fitting noise
+# a refined fit must lower the error by this share, to be worth its computing time and its fit to noise
 WORTH_REFINING = 0.05
-CHANCE = 0.1  # that blocks show a gain where there is none
-# a simulation fit must take this share off a prediction fit's error: it leaves no model of the noise, and a
-# tracker needs one
+CHANCE = 0.1  # probability that blocks show a gain although there is none
+# a simulation fit must be better than a prediction fit by this share of the error, because it has no model of
+# the noise, which a tracker needs
 WORTH_THE_NOISE = 0.2
-# a state that takes less than this share off the error is not worth carrying in a controller
+# a state that lowers the error by less than this share is not worth carrying in a controller
 WORTH_A_STATE = 0.02
-# a refined fit costs some samples x (states + inputs)^2 an iteration: as many candidates are refined as this
-# allows, at least the best one
+# a refined fit costs about samples x (states (states + inputs))^2 an iteration: as many candidates are
+# refined as this allows, but at least the best one
 WORK = 3e8
-# of Gauss-Newton for a candidate without one block: from a consistent start the first few take nearly all
+# Gauss-Newton steps for a candidate without one block: from a consistent start the first few gain nearly all
 VALIDATED_STEPS = 4
 SMALLEST = 1e-9  # share of an output's variation below which an error is rounding
-# of the plants of a spread, which are simulated for ever: no record shows a time constant of 10^6 samples
+# pole radius of plants of a spread, which run for any time: no record shows a time constant of 10^6 samples
 LARGEST_RADIUS = 1.0 - 1e-6
 
 
 class ModelStructure(NamedTuple):
-    """What is fixed before an order is: window (samples), which outputs have direct feed-through (p,),
-    offset, and the dead time of each input (samples)."""
+    """What is fixed before the order: window (samples), which outputs have direct feed-through (p,), offset,
+    and the dead time of each input (samples)."""
 
     past: int
     feedthrough: tuple[bool, ...]
@@ -64,8 +65,9 @@ class ModelStructure(NamedTuple):
 
 
 class Validation(NamedTuple):
-    """How candidates are judged: `blocks` left out in turn, or whole recordings where `recordings` labels the
-    segments with more than one; on simulated outputs, of a record in `closed` loop on predicted ones too."""
+    """How candidates are judged. `blocks` are left out in turn, or whole recordings if `recordings` labels
+    the segments with more than one. They are judged on simulated outputs, and for a record in `closed` loop
+    also on predicted ones."""
 
     blocks: int = 5
     recordings: tuple[int, ...] = ()
@@ -73,9 +75,9 @@ class Validation(NamedTuple):
 
 
 class OrderCandidate(NamedTuple):
-    """One row of the order table: the model's class, and its error on each left-out block (share of each
-    output's variation about the block mean, 1 = no better); about_mean: with the mean of the error taken
-    off."""
+    """One row of the order table: the model's class and its error on each left-out block, as a share of each
+    output's variation about the block mean (1 = no better than the mean). about_mean: the same error with its
+    mean removed."""
 
     order: int
     structure: ModelStructure
@@ -87,14 +89,14 @@ class OrderCandidate(NamedTuple):
 
     @property
     def error(self) -> float:
-        """Geometric mean over the blocks: a block that a disturbance spoils for
-        every candidate then weighs no more than the others."""
+        """Geometric mean over the blocks, so that a block that a disturbance spoils for every candidate
+        weighs no more than the others."""
         return float(np.exp(np.mean(np.log(self.errors))))
 
 
 def longest_window(u: Segments, y: Segments) -> int:
-    """Most lags that leave four complete windows for each unknown of a VARX model, within the width that is
-    paid for; 1 where the record is shorter than that."""
+    """Returns the most lags that leave four complete windows for each unknown of a VARX model, within WIDEST
+    columns; 1 if the record is shorter than that."""
     q, lengths = u[0].shape[1] + y[0].shape[1], np.array([len(w) for w in complete_runs(u, y)])
     supported = [
         past for past in range(2, WIDEST // q + 1) if np.maximum(lengths - past, 0).sum() >= 4 * q * past
@@ -103,11 +105,11 @@ def longest_window(u: Segments, y: Segments) -> int:
 
 
 def windows(data: Lagged) -> tuple[tuple[int, ...], bool]:
-    """Windows worth trying: twice the lags with the least corrected Akaike criterion (Bauer 2005: a subspace
-    method's window must outgrow it), and Schwarz's lags.
+    """Returns the windows worth trying: twice the lags with the smallest corrected Akaike criterion (Bauer
+    2005: a subspace method's window must outgrow it), and Schwarz's lags.
 
-    True beside the shortest window that predicts to rounding, where there is one: the record is noise-free.
-    The errors of every lag stand in the one factor.
+    If a window predicts to rounding, the record is noise-free: returns the shortest such window and True. The
+    one factor holds the errors of every lag.
     """
     p, whole, akaike, schwarz = data.p, np.sum(data.R[:, data.now_y] ** 2), (np.inf, 1), (np.inf, 1)
     for past in range(1, data.past + 1):
@@ -129,10 +131,10 @@ def windows(data: Lagged) -> tuple[tuple[int, ...], bool]:
 
 
 def feedthrough_shows(u: Segments, y: Segments, past: int, offset: bool) -> tuple[bool, ...]:
-    """For each output (p,), whether Schwarz's criterion of its one-step predictor falls when u(t) is added to
-    it. So it does too where a controller answers y(t) at once: the blocks decide."""
+    """Returns for each output (p,) whether Schwarz's criterion of its one-step predictor falls when u(t) is
+    added to it. It also falls if a controller responds to y(t) at once, so the blocks decide."""
     q, rows = u[0].shape[1] + y[0].shape[1], sum(max(len(w) - past, 0) for w in complete_runs(u, y))
-    if rows < (past + 2) * q + 1:  # u(t) is one block of unknowns more than the window was chosen for
+    if rows < (past + 2) * q + 1:  # u(t) adds a block of unknowns to those of the window
         return (False,) * y[0].shape[1]
     power = []
     for feedthrough in (False, True):
@@ -143,19 +145,19 @@ def feedthrough_shows(u: Segments, y: Segments, past: int, offset: bool) -> tupl
 
 
 def dead_time(plant: Plant, longest: int, share: float = 0.05) -> tuple[int, ...]:
-    """Samples, for each input, beyond the one that every strictly proper plant has, before any output answers
-    with `share` of its peak impulse response."""
+    """Returns for each input the samples before any output reaches `share` of its peak impulse response,
+    beyond the one sample that every strictly proper plant has; at most `longest`."""
     h = np.abs(markov_parameters(plant, 10 * longest))
     started = (h >= share * h.max(axis=0)).any(axis=1)
     return tuple(min(int(np.argmax(started[:, j])), longest) for j in range(plant.m))
 
 
 def tested_dead_times(data: Lagged, longest: int) -> tuple[tuple[int, ...], tuple[bool, ...]]:
-    """For each input, the lags 1..k that together do not differ from zero in the one-step predictor, and
-    whether no lag at all does (Wald's test at 99.9 %).
+    """Returns for each input the lags 1..k that together do not differ from zero in the one-step predictor,
+    and whether none of its lags does (Wald's test at 99.9 %).
 
-    A delay at an input is a delay in its predictor too: B_1 ... B_delay
-    of the VARX model are zero, in closed loop as well.
+    A delay at an input is a delay in its predictor too: B_1 ... B_delay of the VARX model are zero, in closed
+    loop as well.
     """
     m, p, first = data.m, data.p, data.m if data.feedthrough else 0
     coefficients, errors = one_step(data, data.past)
@@ -184,17 +186,17 @@ def tested_dead_times(data: Lagged, longest: int) -> tuple[tuple[int, ...], tupl
 
 
 def noise_edge(data: Lagged, past: int) -> float:
-    """sqrt(2) (sqrt(past p) + sqrt(past (m+p))): above what the
-    coefficients' error alone puts into the singular values.
+    """Returns sqrt(2) (sqrt(past p) + sqrt(past (m+p))). Singular values above it are larger than those from
+    coefficient errors alone.
 
-    A matrix of independent unit noise of that shape stays under the bracket; here each error stands in up to
-    `past` rows, which adds some tenth (measured).
+    A matrix of independent unit noise of that shape stays below the bracket. Here each error appears in up to
+    `past` rows, which adds about a tenth (measured).
     """
     return float(np.sqrt(2) * (np.sqrt(past * data.p) + np.sqrt(past * (data.m + data.p))))
 
 
 def shifted(u: Segments, y: Segments, delays: tuple[int, ...]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """u_j(t - delay_j) beside y(t), the first max(delays) samples of each segment left out."""
+    """Returns u_j(t - delay_j) beside y(t), without the first max(delays) samples of each segment."""
     most = max(delays)
     return [np.column_stack([a[most - d : len(a) - d, j] for j, d in enumerate(delays)]) for a in u], [
         b[most:] for b in y
@@ -202,8 +204,8 @@ def shifted(u: Segments, y: Segments, delays: tuple[int, ...]) -> tuple[list[np.
 
 
 def with_delays(plant: Plant, delays: tuple[int, ...]) -> Plant:
-    """The plant behind a chain of delays: u_j(t-1) ... u_j(t-delay_j)
-    become states, and B_j acts through the last of them."""
+    """Returns the plant behind a chain of delays: u_j(t-1) ... u_j(t-delay_j) become states, and B_j acts
+    through the last of them."""
     if not any(delays):
         return plant
     n, size = plant.n, plant.n + sum(delays)
@@ -236,16 +238,16 @@ def with_delays(plant: Plant, delays: tuple[int, ...]) -> Plant:
 
 
 def stabilised(plant: Plant, radius: float) -> Plant:
-    """The plant with every pole beyond `radius` drawn back onto it along its ray."""
+    """Returns the plant with every pole beyond `radius` moved onto it along its ray."""
     return plant._replace(A=clip_spectral_radius(plant.A, radius))
 
 
 def simulation_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
-    """For each segment and output, the size of the simulation error as a share of the output's variation, at
-    most 1: as it is and about its mean, shape (2, segments, p).
+    """Returns for each segment and output the size of the simulation error as a share of the output's
+    variation, at most 1: as it is and about its mean, shape (2, segments, p).
 
-    The initial state is fitted to the segment. A plant whose simulation overflows counts as no better than
-    the mean.
+    The initial state is fitted to the segment. If the simulation overflows, the plant counts as no better
+    than the mean.
     """
     model, shares = simulation_form(plant, []), []
     for a, b in zip(u, y, strict=True):
@@ -273,12 +275,12 @@ def simulation_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
 def folds(
     u: Segments, y: Segments, count: int, recordings: tuple[int, ...] = ()
 ) -> list[tuple[list, list, list, list]]:
-    """(u, y, u left out, y left out) with one of `count` blocks of each segment left out in turn; what
-    remains on either side are segments of their own.
+    """Returns (u, y, u left out, y left out) with one of `count` blocks of each segment left out in turn. The
+    parts before and after the block are separate segments.
 
-    Of several segments, those too short to be cut into blocks of 10 samples
-    are left out whole, every count-th of them in turn. Of several `recordings` (a label for each
-    segment) one is left out at a time, or every count-th of more than `count`.
+    If there are several segments, those too short for blocks of 10 samples are left out whole, every count-th
+    of them in turn. If there are several `recordings` (a label for each segment), one is left out at a time,
+    or every count-th if there are more than `count`.
     """
     out, labels = [], sorted(set(recordings))
     if len(labels) > 1:
@@ -307,8 +309,8 @@ def folds(
 
 
 def prediction_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
-    """For each segment and output, the size of the one-step error as a share of the output's variation, at
-    most 1; shape (segments, p). The initial state is fitted to the segment."""
+    """Returns for each segment and output the size of the one-step error as a share of the output's
+    variation, at most 1; shape (segments, p). The initial state is fitted to the segment."""
     spreads = [np.maximum(np.nanstd(b, axis=0), np.finfo(float).tiny) for b in y]
     with np.errstate(over="ignore", invalid="ignore"):
         errors = zip(one_step_errors(plant, u, y), spreads, strict=True)
@@ -319,13 +321,14 @@ def prediction_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
 def fit(
     kind: Fit, start: Plant, u: Segments, y: Segments, settings: FitSettings, *, gain: bool = True
 ) -> Plant:
-    """The plant that the named fit makes of the subspace start: the start itself, refined
-    on one-step errors, or refined on simulation errors.
+    """Returns the plant that this kind of fit makes of the subspace start: the start itself, or the start
+    refined on one-step errors or on simulation errors.
 
-    Every pole stays within `settings.max_radius` where given, and a refined plant's within `LARGEST_RADIUS`:
-    beyond the circle is noise about an integrator. A refined plant is drawn back onto it and refined again
-    within it; a fit that may not cross it from the start stops at it, up to 6 points short on the hold-out of
-    the study's record (measured). `gain` False leaves a plant refined on simulation errors without K.
+    Every pole stays within `settings.max_radius` if it is given, and those of a refined plant within
+    `LARGEST_RADIUS`: a pole beyond the circle is noise about an integrator. A refined plant is moved back
+    onto that radius and refined again within it. A fit that may never cross it stops at it; this cost up to 6
+    points on the hold-out of the study's record (measured). With `gain` False a plant refined on simulation
+    errors has no K.
     """
     # a mode may grow 20-fold over the longest segment while a plant is refined, no more
     radius = settings.max_radius or float(np.exp(3.0 / max(map(len, u))))
@@ -347,7 +350,7 @@ def fit(
         )
     refined = _refined(kind, start, u, y, settings, radius)
     drawn = stabilised(refined, LARGEST_RADIUS)
-    # nearly equal poles may not be drawn back to rounding: such a plant stays as it is
+    # nearly equal poles may not move back exactly; such a plant is kept as it is
     if drawn.A is not refined.A and np.abs(np.linalg.eigvals(drawn.A)).max() <= LARGEST_RADIUS:
         refined = _refined(kind, drawn, u, y, settings, LARGEST_RADIUS)
     return kalman_gain(refined, u, y) if gain and kind == "simulation" else refined
@@ -356,15 +359,15 @@ def fit(
 def _refined(
     kind: Criterion, start: Plant, u: Segments, y: Segments, settings: FitSettings, radius: float
 ) -> Plant:
-    """`refine` with every pole within `radius`, from a start whose predictor may not be stable."""
+    """Runs `refine` with every pole within `radius`, from a start whose predictor may not be stable."""
     if kind == "prediction":
         start = with_stable_predictor(start, u, y)
     return refine(start, u, y, kind, settings._replace(max_radius=radius * (1 + 1e-12)))[0]
 
 
 def with_stable_predictor(plant: Plant, u: Segments, y: Segments) -> Plant:
-    """The plant as it is where A - K C is stable, else with the Kalman gain of the record: the errors of an
-    unstable predictor grow without limit."""
+    """Returns the plant unchanged if A - K C is stable, otherwise with the Kalman gain of the record, because
+    the errors of an unstable predictor grow without limit."""
     if np.abs(np.linalg.eigvals(plant.A - plant.K @ plant.C)).max() < 1:
         return plant
     return kalman_gain(plant, u, y)
@@ -380,10 +383,10 @@ def cross_validate(
     singular_values,
     validation: Validation,
 ) -> list[OrderCandidate]:
-    """The order table's rows for one structure: each order and fit, identified without a block and judged
-    on it, for each block or recording.
+    """Returns the order table's rows for one structure. Each order and fit is identified without one block or
+    recording and judged on it, for each of them in turn.
 
-    A structure whose window does not fit into what remains of the record has no rows.
+    A structure whose window does not fit into the remaining record has no rows.
     """
     u, y = shifted(u, y, structure.delays)
     settings = FitSettings(structure.feedthrough, structure.offset, max_iterations=VALIDATED_STEPS)
@@ -406,15 +409,15 @@ def cross_validate(
                 plant = fit(kind, start, train_u, train_y, settings, gain=False)
                 shares = simulation_errors(plant, test_u, test_y)
                 if validation.closed:
-                    # under feedback a simulation is right in part because u holds the noise of y; one step
-                    # ahead it is not, but slow modes gain little there
+                    # under feedback a simulation is partly right only because u contains the noise of y. A
+                    # one-step prediction is not, but slow modes gain little there
                     shares = np.sqrt(shares * prediction_errors(plant, test_u, test_y))
                 whole, about_mean = shares.mean(axis=(1, 2))
                 errors.setdefault((order, kind), []).append(
                     (max((whole + about_mean) / 2, SMALLEST), max(about_mean, SMALLEST))
                 )
     m, p = u[0].shape[1], y[0].shape[1]
-    # a dead time must be worth a state
+    # a dead time counts as much as a state, so it must be worth one
     more = m * sum(structure.feedthrough) + p * structure.offset + (m + p) * sum(map(bool, structure.delays))
     return [
         OrderCandidate(
@@ -430,18 +433,19 @@ def cross_validate(
 
 
 def slow_window(plant: Plant, longest: int) -> int:
-    """The window that spans the time constant of a plant's slowest mode that decays, at most `longest`."""
+    """Returns the window that spans the time constant of a plant's slowest decaying mode, at most
+    `longest`."""
     radii = np.abs(np.linalg.eigvals(plant.A))
     slowest = max(radii[radii < 1 - 1e-6], default=0.0)
     return int(min(np.ceil(-1.0 / np.log(max(slowest, 1e-3))), longest))
 
 
 def simplest(table: list[OrderCandidate], worth: float = WORTH_A_STATE) -> OrderCandidate:
-    """The row with the fewest parameters whose error is within `worth` of the best row's.
+    """Returns the row with the fewest parameters whose error is within `worth` of the best row's.
 
-    Not within one standard error: five blocks of which one holds a disturbance have so wide a one that models
-    much too small pass, and these cost more on new data than models somewhat too large (measured on the
-    records of tests/foreign/records.py).
+    One standard error is not used as the tolerance. If one of five blocks holds a disturbance, the standard
+    error is so wide that far too small models pass. These cost more on new data than models that are somewhat
+    too large (measured on the records of tests/foreign/records.py).
     """
     best = min(row.error for row in table)
     return min(
@@ -450,11 +454,11 @@ def simplest(table: list[OrderCandidate], worth: float = WORTH_A_STATE) -> Order
 
 
 def worth_refining(start: OrderCandidate, refined: OrderCandidate) -> bool:
-    """Whether a refined fit takes `WORTH_REFINING` off the error of its start, and off the error about the
-    mean too, beyond chance: Student's t of the blocks' paired gains, one-sided at `CHANCE`.
+    """Returns whether a refined fit lowers the error of its start by more than `WORTH_REFINING`, and the
+    error about the mean beyond chance too: Student's t of the blocks' paired gains, one-sided at `CHANCE`.
 
-    A gain in level alone is the ambient of those days, which blocks inside a record tell and new data do not:
-    fits chosen by it lost 5 and 31 points on the hold-outs of two two-heater kits.
+    A gain in level alone comes from the ambient of those days. Blocks inside a record show it, but new data
+    do not: fits chosen by it lost 5 and 31 points on the hold-outs of two two-heater kits.
     """
     if refined.error >= (1 - WORTH_REFINING) * start.error:
         return False
@@ -462,8 +466,8 @@ def worth_refining(start: OrderCandidate, refined: OrderCandidate) -> bool:
 
 
 def beyond_chance(gains: np.ndarray) -> bool:
-    """Whether the mean of paired gains (blocks,) is above zero by Student's t, one-sided at `CHANCE`; of one
-    block, its sign."""
+    """Returns whether the mean of paired gains (blocks,) is above zero by Student's t, one-sided at `CHANCE`.
+    With one block, its sign decides."""
     if len(gains) < 2:
         return bool(gains.mean() > 0)
     uncertain = np.std(gains, ddof=1) / np.sqrt(len(gains))

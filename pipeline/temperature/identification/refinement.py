@@ -1,11 +1,14 @@
 """Prediction-error refinement of an identified plant: Gauss-Newton on one-step or simulation errors over
 whole records (Ljung, System Identification, ch. 7 and 10).
 
-Both criteria are one output-error problem  x(t+1) = F x + G v,  ŷ = C x + H v:
-  prediction  v = [u; 1; y],  F = A - K C,  G = [B - K D, b - K d, K],  H = [D, d, 0]
-  simulation  v = [u; 1],     F = A,        G = [B, b],                 H = [D, d]
-so one routine serves both. It needs no filter per parameter: in block-modal coordinates every sensitivity is
-a first-order filter of one signal.
+Both criteria are the same output-error problem:
+
+    x(t+1) = F x + G v,  ŷ = C x + H v
+    prediction  v = [u; 1; y],  F = A - K C,  G = [B - K D, b - K d, K],  H = [D, d, 0]
+    simulation  v = [u; 1],     F = A,        G = [B, b],                 H = [D, d]
+
+So one routine serves both. It needs no filter per parameter, because in block-modal coordinates every
+sensitivity is a first-order filter of one signal.
 """
 
 from collections.abc import Sequence
@@ -21,9 +24,9 @@ Criterion = Literal["prediction", "simulation"]
 
 
 class FitSettings(NamedTuple):
-    """What a fit may move, and when it stops. `feedthrough`: D is free, or the rows of it that are marked;
-    `offset`: b and d are; every pole stays within `max_radius` where given; a step must gain `tolerance` of
-    the cost."""
+    """What a fit may change, and when it stops. `feedthrough`: D is free, or the marked rows of it; `offset`:
+    b and d are free; every pole stays within `max_radius` if given; a step must lower the cost by the share
+    `tolerance`."""
 
     feedthrough: bool | tuple[bool, ...] = False
     offset: bool = True
@@ -39,7 +42,8 @@ class Predictor(NamedTuple):
     """x(t+1) = F x + G v
     ŷ = C x + H v
 
-    with one initial state a segment: F (n, n), G (n, r), C (p, n), H (p, r), x0 list of (n,)."""
+    with one initial state per segment: F (n, n), G (n, r), C (p, n), H (p, r), x0 list of (n,).
+    """
 
     F: np.ndarray
     G: np.ndarray
@@ -49,8 +53,8 @@ class Predictor(NamedTuple):
 
 
 def linear_recurrence(F: np.ndarray, g: np.ndarray, x0: np.ndarray) -> np.ndarray:
-    """x (T+1, n) of x(t+1) = F x(t) + g(t) from x0, by doubling: pass k adds F^(2^k) times what lies 2^k
-    samples back (Hillis and Steele 1986)."""
+    """Returns x (T+1, n) of x(t+1) = F x(t) + g(t) from x0, by doubling: pass k adds F^(2^k) times the values
+    2^k samples before (Hillis and Steele 1986)."""
     x, power, lag = np.vstack([x0[None], g]), F, 1
     while lag < len(x) and np.abs(power).max() > 1e-20:
         x[lag:] += x[:-lag] @ power.T
@@ -59,14 +63,14 @@ def linear_recurrence(F: np.ndarray, g: np.ndarray, x0: np.ndarray) -> np.ndarra
 
 
 def respond(model: Predictor, v: np.ndarray, x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """States x (T, n) and outputs ŷ (T, p) of the predictor under v (T, r)."""
+    """Returns states x (T, n) and outputs ŷ (T, p) of the predictor under v (T, r)."""
     x = linear_recurrence(model.F, v @ model.G.T, x0)[:-1]
     return x, x @ model.C.T + v @ model.H.T
 
 
 def free_response(model: Predictor, T: int) -> np.ndarray:
-    """[C; CF; ...; CF^(T-1)] (T, p, n), the outputs' response to each
-    state at the start; doubles with each pass."""
+    """Returns [C; CF; ...; CF^(T-1)] (T, p, n), the outputs' response to each initial state. Its length
+    doubles with each pass."""
     gamma, power = model.C[None], model.F
     with np.errstate(
         over="ignore", invalid="ignore"
@@ -77,17 +81,17 @@ def free_response(model: Predictor, T: int) -> np.ndarray:
 
 
 def _without_underflow(response: np.ndarray) -> np.ndarray:
-    """A response that decayed under 1e-100 as zero there: products of such numbers underflow, and processors
-    take ten times as long over them (Z'Z of 6,000 samples: 40 against 4 ms)."""
+    """Returns the response with values below 1e-100 set to zero. Products of such numbers underflow, which
+    takes processors ten times as long (Z'Z of 6,000 samples: 40 ms instead of 4 ms)."""
     return np.where(np.abs(response) < 1e-100, 0.0, response)
 
 
 def estimate_state(model: Predictor, v: np.ndarray, y: np.ndarray, *, free_mean: bool = False) -> np.ndarray:
-    """x(0) (n,) that fits y (T, p) best in least squares under v; NaN in y is left out. A
-    direction of x(0) that y does not show stays zero.
+    """Returns x(0) (n,) that fits y (T, p) best in least squares under v; NaN in y is left out. A direction
+    of x(0) that y does not show is zero.
 
-    With `free_mean` a constant for each output is fitted along and
-    dropped, for scores that remove the mean of the error.
+    With `free_mean` a constant for each output is fitted too and then dropped, for scores that remove the
+    mean of the error.
     """
     n = len(model.F)
     return fitted_state(
@@ -96,8 +100,8 @@ def estimate_state(model: Predictor, v: np.ndarray, y: np.ndarray, *, free_mean:
 
 
 def fitted_state(gamma: np.ndarray, error: np.ndarray, *, free_mean: bool) -> np.ndarray:
-    """x(0), and with `free_mean` a constant for each output after it, that leave the least
-    of error (T, p); what is not finite is left out."""
+    """Returns x(0), and with `free_mean` a constant for each output after it, that explain error (T, p) best
+    in least squares. Values that are not finite are left out."""
     T, p, _ = gamma.shape
     regressors = (
         gamma if not free_mean else np.concatenate([gamma, np.broadcast_to(np.eye(p), (T, p, p))], axis=2)
@@ -107,8 +111,8 @@ def fitted_state(gamma: np.ndarray, error: np.ndarray, *, free_mean: bool) -> np
 
 
 def _block_modal(model: Predictor) -> tuple[Predictor, list[tuple[int, complex]], np.ndarray]:
-    """The predictor with F block diagonal (1 x 1 real, 2 x 2 [[a, b], [-b, a]] for a + ib), (first row,
-    eigenvalue) of each block, and the basis."""
+    """Returns the predictor with F block diagonal (1 x 1 real, 2 x 2 [[a, b], [-b, a]] for a + ib), (first
+    row, eigenvalue) of each block, and the basis."""
     eigenvalues, vectors = np.linalg.eig(model.F)
     columns, blocks = [], []
     for eigenvalue, vector in zip(eigenvalues, vectors.T, strict=True):
@@ -128,11 +132,11 @@ def _block_modal(model: Predictor) -> tuple[Predictor, list[tuple[int, complex]]
 
 
 def _filtered(blocks: list[tuple[int, complex]], s: np.ndarray, numerator: list[float]) -> np.ndarray:
-    """f (T, n, k): signal s_j (T, k) through the first-order filter of each mode, real and imaginary part of
-    a pair in its two rows; numerator [0, 1] for an input, [1] for x0.
+    """Returns f (T, n, k): signal s_j (T, k) through the first-order filter of each mode. A complex pair has
+    its real and imaginary part in its two rows. numerator: [0, 1] for an input, [1] for x0.
 
-    The response of ŷ_o to s_j entering at state i is a mixture of f by C alone (`_mixed`), so one set of
-    filtered signals serves every output.
+    The response of ŷ_o to s_j entering at state i is a mixture of f that depends on C alone (`_mixed`), so
+    one set of filtered signals serves every output.
     """
     f = np.empty((len(s), sum(1 + (eigenvalue.imag > 0) for _, eigenvalue in blocks), s.shape[1]))
     for k, eigenvalue in blocks:
@@ -145,7 +149,7 @@ def _filtered(blocks: list[tuple[int, complex]], s: np.ndarray, numerator: list[
 
 
 def _mixing(c: np.ndarray, blocks: list[tuple[int, complex]]) -> np.ndarray:
-    """M (n, n) with sensitivity = M f for the output whose row of C is c: [c_k] for a real mode,
+    """Returns M (n, n) with sensitivity = M f for the output whose row of C is c: [c_k] for a real mode,
     [[c_k, -c_k+1], [c_k+1, c_k]] for a pair."""
     M = np.zeros((len(c), len(c)))
     for k, eigenvalue in blocks:
@@ -156,18 +160,19 @@ def _mixing(c: np.ndarray, blocks: list[tuple[int, complex]]) -> np.ndarray:
 
 
 def _mixed(c: np.ndarray, blocks: list[tuple[int, complex]], f: np.ndarray) -> np.ndarray:
-    """Sensitivities (T, n k) of the output whose row of C is c."""
+    """Returns the sensitivities (T, n k) of the output whose row of C is c."""
     return np.einsum("il,tlj->tij", _mixing(c, blocks), f, optimize=True).reshape(len(f), -1)
 
 
 def _normal_equations(
     model: Predictor, blocks, free: np.ndarray, v_all, y_all
 ) -> tuple[np.ndarray, np.ndarray]:
-    """J'J and J'e over every segment; parameters: [F G] row by row, then C and the columns of H that are free
-    (p, r) in some row for each output, then x0 of each segment. What is not free has zeros there.
+    """Returns J'J and J'e over every segment. The parameters are [F G] row by row; then, for each output, C
+    and the columns of H that are free (p, r) in some row; then x0 of each segment. Entries that are not free
+    are zero.
 
-    With J_o = Z M_o the products over the samples, Z'Z and Z'e, are the same for every output that is
-    measured at the same samples: taken once.
+    With J_o = Z M_o the products over the samples, Z'Z and Z'e, are the same for every output measured at the
+    same samples, so they are computed once.
     """
     n, r = model.G.shape
     columns = np.flatnonzero(free.any(axis=0))
@@ -233,7 +238,7 @@ def _stepped(model: Predictor, step: np.ndarray, free: np.ndarray) -> Predictor:
 def _cost(model: Predictor, v_all, y_all) -> float:
     with np.errstate(
         over="ignore", invalid="ignore"
-    ):  # a trial step may explode; its cost is then infinite and the step refused
+    ):  # a trial step may diverge; its cost is then infinite and the step is rejected
         cost = sum(
             np.nansum((y - respond(model, v, x0)[1]) ** 2)
             for v, y, x0 in zip(v_all, y_all, model.x0, strict=True)
@@ -247,12 +252,13 @@ def _cost(model: Predictor, v_all, y_all) -> float:
 def gauss_newton(
     model: Predictor, v_all, y_all, *, free: np.ndarray, admissible, max_iterations: int, tolerance: float
 ) -> tuple[Predictor, list[float]]:
-    """Levenberg-Marquardt on sum |y - ŷ|² over F, G, C, the entries of H that are
-    `free` (p, r) and every x0; NaN in y is left out.
+    """Runs Levenberg-Marquardt on sum |y - ŷ|² over F, G, C, the `free` (p, r) entries of H and every x0; NaN
+    in y is left out. Returns the model, and its cost at the start and after each step.
 
-    The parameters are redundant (any change of state basis); the damping picks the step of least norm among
-    equals. `admissible(F, G, C)` refuses steps, which is how stability is kept by construction. Stops when a
-    step gains less than `tolerance` of the cost; a start whose errors are not finite is returned as it is.
+    The parameters are redundant (any change of state basis); among equal steps the damping selects the one of
+    least norm. `admissible(F, G, C)` rejects steps, which keeps the model stable by construction. Stops when
+    a step lowers the cost by less than the share `tolerance`. Returns a start whose errors are not finite
+    unchanged.
     """
     costs, damping = [_cost(model, v_all, y_all)], 1e-4
     for _ in range(max_iterations if np.isfinite(costs[0]) else 0):
@@ -282,11 +288,11 @@ def gauss_newton(
 
 
 def fit_inputs(A, C, u, y, *, feedthrough: bool | tuple[bool, ...], offset: bool) -> Predictor:
-    """B, b, D, d and every x0 that simulate y best for given A (n, n), C (p, n): a linear least-squares
-    problem (Verhaegen 1994; SLICOT IB01CD).
+    """Fits B, b, D, d and every x0 so that the simulation matches y best, for given A (n, n), C (p, n): a
+    linear least-squares problem (Verhaegen 1994; SLICOT IB01CD).
 
-    Returns the simulator in its block-modal basis, v = [u; 1]. b is left at zero, and d too, where `offset`
-    is False; rows of D that `feedthrough` does not mark are zero.
+    Returns the simulator in its block-modal basis, v = [u; 1]. b and d are zero if `offset` is False; rows of
+    D that `feedthrough` does not mark are zero.
     """
     n, m, p, segments = len(A), u[0].shape[1], len(C), len(u)
     allowed = free_entries(p, m, feedthrough, offset=offset)
@@ -326,25 +332,26 @@ def fit_inputs(A, C, u, y, *, feedthrough: bool | tuple[bool, ...], offset: bool
 
 
 def free_entries(p: int, m: int, feedthrough: bool | tuple[bool, ...], *, offset: bool) -> np.ndarray:
-    """Which entries of [D, d] (p, m + 1) a fit may move."""
+    """Returns which entries of [D, d] (p, m + 1) a fit may change."""
     rows = np.broadcast_to(np.asarray(feedthrough, bool), (p,))
     return np.column_stack([np.repeat(rows[:, None], m, axis=1), np.full(p, offset)])
 
 
 def prediction_form(plant: Plant, x0: Sequence[np.ndarray]) -> Predictor:
-    """The one-step predictor of a plant:
+    """Returns the one-step predictor of a plant:
 
     v = [u; 1; y]
     F = A - K C
     G = [B - K D, b - K d, K]
-    H = [D, d, 0]"""
+    H = [D, d, 0]
+    """
     A, B, C, D, b, d, K, _ = plant
     G = np.hstack([B - K @ D, (b - K @ d)[:, None], K])
     return Predictor(A - K @ C, G, C, np.hstack([D, d[:, None], np.zeros((plant.p, plant.p))]), list(x0))
 
 
 def simulation_form(plant: Plant, x0: Sequence[np.ndarray]) -> Predictor:
-    """The simulator of a plant: v = [u; 1], F = A, G = [B, b], H = [D, d]."""
+    """Returns the simulator of a plant: v = [u; 1], F = A, G = [B, b], H = [D, d]."""
     return Predictor(
         plant.A,
         np.hstack([plant.B, plant.b[:, None]]),
@@ -355,14 +362,14 @@ def simulation_form(plant: Plant, x0: Sequence[np.ndarray]) -> Predictor:
 
 
 def drives(criterion: str, u: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """v (T, r) of the criterion's predictor."""
+    """Returns v (T, r) of the criterion's predictor."""
     one = np.ones((len(u), 1))
     return np.hstack([u, one, y]) if criterion == "prediction" else np.hstack([u, one])
 
 
 def filled(plant: Plant, u: np.ndarray, y: np.ndarray, x0: np.ndarray) -> np.ndarray:
-    """y (T, p) with each masked entry replaced by its one-step prediction, which is
-    what a Kalman filter without that measurement does."""
+    """Returns y (T, p) with each masked entry replaced by its one-step prediction, as a Kalman filter without
+    that measurement does."""
     if np.isfinite(y).all():
         return y
     y, x = y.copy(), x0
@@ -374,19 +381,19 @@ def filled(plant: Plant, u: np.ndarray, y: np.ndarray, x0: np.ndarray) -> np.nda
 
 
 def simulated(plant: Plant, u: np.ndarray, y: np.ndarray, *, means_removed: bool = False) -> np.ndarray:
-    """ŷ (T, p) of the plant under u (T, m) alone, from the initial state that fits all of y (T, p) best (the
-    rule of SLICOT's IB01CD and of MATLAB's compare).
+    """Returns ŷ (T, p) of the plant under u (T, m) alone, from the initial state that fits all of y (T, p)
+    best (the rule of SLICOT's IB01CD and of MATLAB's compare).
 
     With `means_removed` the initial state is fitted to the error without its mean, for a score that removes
-    it.
+    the mean.
     """
     model, v = simulation_form(plant, []), drives("simulation", u, y)
     return respond(model, v, estimate_state(model, v, y, free_mean=means_removed))[1]
 
 
 def one_step_errors(plant: Plant, u: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """e(t) = y(t) - ŷ(t | t-1) (T, p) of each segment, the initial state fitted to the segment; NaN where y
-    is masked."""
+    """Returns e(t) = y(t) - ŷ(t | t-1) (T, p) of each segment, with the initial state fitted to the segment;
+    NaN if y is masked."""
     model, out = prediction_form(plant, []), []
     for a, b in zip(u, y, strict=True):
         v = drives("prediction", a, filled(plant, a, b, np.zeros(plant.n)))
@@ -401,13 +408,13 @@ def refine(
     criterion: Criterion = "prediction",
     settings: FitSettings = DEFAULTS,
 ) -> tuple[Plant, list[float]]:
-    """The plant moved to the least sum of weighted squared errors, one step ahead or in free simulation, over
-    every segment u (T, m), y (T, p); and that sum before the first and after each step.
+    """Returns the plant with the least sum of weighted squared errors, one step ahead or in free simulation,
+    over every segment u (T, m), y (T, p); and that sum at the start and after each step.
 
-    Errors are weighted by the covariance of the starting model's (the full one for predictions, its diagonal
-    for simulation). The predictor stays stable, and so does A within `max_radius` where given (it must hold
-    at the start). With `simulation` K is left zero: `kalman_gain` fits it. NaN in y is a masked sample; u has
-    none.
+    Errors are weighted by the error covariance of the starting model (the full one for predictions, its
+    diagonal for simulation or if only some rows of D are free). The predictor stays stable, and A stays
+    within `max_radius` if given (it must do so at the start). With "simulation" K is zero, and `kalman_gain`
+    fits it. NaN in y is a masked sample; u has none.
     """
     m, ahead = plant.m, criterion == "prediction"
     rows = np.broadcast_to(np.asarray(settings.feedthrough, bool), (plant.p,))
@@ -441,8 +448,8 @@ def refine(
 def _weighted(
     plant: Plant, u, y, criterion: Criterion, *, diagonal: bool
 ) -> tuple[Predictor, list[np.ndarray], list[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """What Gauss-Newton solves: the starting predictor, its drives and the outputs, in units in which the
-    starting errors have covariance I; and the weight (p, p) that leads there, and back."""
+    """Returns the problem for Gauss-Newton: the starting predictor, its drives and the outputs, in units in
+    which the starting errors have covariance I; and the weight (p, p) to those units, and back."""
     m, ahead = plant.m, criterion == "prediction"
     start = prediction_form(plant, []) if ahead else simulation_form(plant, [])
     y_full = y
@@ -463,7 +470,7 @@ def _weighted(
 
 
 def _plant_of(best: Predictor, weights: tuple[np.ndarray, np.ndarray], plant: Plant, *, ahead: bool) -> Plant:
-    """The plant whose weighted predictor or simulator is `best`, in the units of `plant`."""
+    """Returns the plant whose weighted predictor or simulator is `best`, in the units of `plant`."""
     m, (weight, unweight) = plant.m, weights
     C, H = unweight @ best.C, unweight @ best.H
     K = best.G[:, m + 1 :] @ weight if ahead else np.zeros((plant.n, plant.p))
@@ -473,8 +480,8 @@ def _plant_of(best: Predictor, weights: tuple[np.ndarray, np.ndarray], plant: Pl
 
 
 def stabilising_gain(plant: Plant) -> np.ndarray:
-    """K (n, p) with A - K C stable: zero where A is, else the Kalman gain for process noise that enters as
-    the inputs do (or into every state, where there are none)."""
+    """Returns K (n, p) with A - K C stable: zero if A is stable, otherwise the Kalman gain for process noise
+    that enters mainly as the inputs do, and slightly into every state."""
     if np.abs(np.linalg.eigvals(plant.A)).max() < 1:
         return np.zeros((plant.n, plant.p))
     A, C = plant.A, plant.C
@@ -488,11 +495,11 @@ def stabilising_gain(plant: Plant) -> np.ndarray:
 def kalman_gain(
     plant: Plant, u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, max_iterations: int = 20
 ) -> Plant:
-    """The plant with the gain K that makes the one-step errors least, all else kept; Gauss-Newton from a gain
-    that stabilises, where dŷ/dK_ij answers e_j entering at state i.
+    """Returns the plant with the gain K of the smallest one-step errors, with all else unchanged.
+    Gauss-Newton starts from a stabilising gain; dŷ/dK_ij is the response to e_j entering at state i.
 
-    Errors are weighted by their variance at the start. A plant with an unstable mode that no output shows has
-    no such gain, and is returned as it is.
+    Errors are weighted by their variance at the start. If the plant has an unstable mode that no output
+    shows, there is no such gain, and the plant is returned unchanged.
     """
     try:
         K = stabilising_gain(plant)
@@ -542,8 +549,8 @@ def _first_state(start, criterion, u, y):
 
 
 def _weights(errors: np.ndarray, *, diagonal: bool) -> tuple[np.ndarray, np.ndarray]:
-    """W and its inverse with W'W = S^-1, S (p, p) the covariance of the
-    errors; noise-free channels are floored at rounding."""
+    """Returns W with W'W = S^-1 and its inverse. S (p, p) is the covariance of the errors; the variance of
+    noise-free channels is set to rounding."""
     rows = errors[np.isfinite(errors).all(1)]
     S = rows.T @ rows / max(len(rows), 1)
     S = np.diag(np.diag(S)) if diagonal else S

@@ -1,4 +1,4 @@
-"""The record as identification and learning take it: segments of inputs and outputs."""
+"""The record in the form for identification and learning: segments of inputs and outputs."""
 
 from collections.abc import Mapping, Sequence
 
@@ -10,11 +10,12 @@ from pipeline.temperature.identification.model_choice import gapless
 def segments(
     table: Mapping[str, np.ndarray], inputs: Sequence[str], outputs: Sequence[str]
 ) -> tuple[list[np.ndarray], list[np.ndarray], list[str]]:
-    """Segments u (T, m) and y (T, p) of the table of ingest, masked samples as NaN, and the recording of
-    each.
+    """Returns segments u (T, m) and y (T, p) of the table of ingest, with masked samples as NaN, and the
+    recording of each segment.
 
-    A segment ends at a gap and at the end of a recording. `inputs` names what acts on the outputs:
-    disturbances follow the inputs."""
+    A segment ends at a gap and at the end of a recording. `inputs` names the signals that act on the outputs:
+    first the inputs, then the disturbances.
+    """
     u, y = (
         np.stack([np.where(table[f"{name}_masked"], np.nan, table[name]) for name in names], axis=1)
         for names in (inputs, outputs)
@@ -27,7 +28,7 @@ def segments(
 def without_gaps(
     u: Sequence[np.ndarray], y: Sequence[np.ndarray], recordings: Sequence[str]
 ) -> tuple[list[np.ndarray], list[np.ndarray], list[int]]:
-    """Segments without a missing input, and the number of the recording of each."""
+    """Returns segments without a missing input, and the number of each segment's recording."""
     names = list(dict.fromkeys(recordings))
     pieces = [
         (a, b, names.index(name))
@@ -40,7 +41,8 @@ def without_gaps(
 def split(
     u: Sequence[np.ndarray], y: Sequence[np.ndarray], last_share: float
 ) -> tuple[tuple[list[np.ndarray], list[np.ndarray]], tuple[list[np.ndarray], list[np.ndarray]]]:
-    """(u, y) of the first part of every segment, and of its last part."""
+    """Returns (u, y) of the first part of every segment, and of its last part, which has the share
+    `last_share`."""
     cuts = [round(len(segment) * (1 - last_share)) for segment in u]
     first = [[segment[:cut] for segment, cut in zip(signal, cuts, strict=True)] for signal in (u, y)]
     last = [[segment[cut:] for segment, cut in zip(signal, cuts, strict=True)] for signal in (u, y)]

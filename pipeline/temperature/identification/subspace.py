@@ -1,8 +1,8 @@
 """Subspace identification: PBSID with a Kalman gain (Chiuso 2007), over several segments.
 
-Records come as segments u (T, m), y (T, p); a NaN is a masked sample, and every row whose window touches one
-is dropped and counted. Everything that PBSID needs is in one triangular factor of the lagged record, so
-neither the order nor the horizon costs another pass over the samples.
+Records are segments u (T, m), y (T, p). A NaN is a masked sample; every row whose window contains one is
+dropped and counted. One triangular factor of the lagged record holds everything that PBSID needs, so neither
+the order nor the horizon costs another pass over the samples.
 """
 
 from collections.abc import Sequence
@@ -14,14 +14,14 @@ import scipy.linalg
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.plant import plant as make_plant
 
-ROUNDING = 1e-13  # relative ridge on second moments: what their own rounding amounts to
+ROUNDING = 1e-13  # relative ridge on second moments, as large as their own rounding
 RANK = 1e-11  # directions of the record below this share of the largest are rounding
 Segments = Sequence[np.ndarray]
 
 
 class Lagged(NamedTuple):
-    """Triangular factor of the lagged record, w = [u; y] shifted and scaled, with the columns
-    [u(t) if feed-through, w(t-1), ..., w(t-past), u(t) if not, y(t)].
+    """Triangular factor R of the lagged record, w = [u; y] shifted and scaled, with the columns [u(t) if
+    feed-through, w(t-1), ..., w(t-past), u(t) if not, y(t)].
 
     R'R is the second moment of those columns about their mean (with an offset) or about zero (without); means
     (past+1, m+p) holds the mean of w(t-lag) over the rows.
@@ -47,14 +47,14 @@ class Lagged(NamedTuple):
         return np.arange(self.R.shape[1] - self.p, self.R.shape[1])
 
     def lags(self, first: int, last: int) -> np.ndarray:
-        """Columns of w(t-first) ... w(t-last); lag 0 is w(t) itself."""
+        """Returns the columns of w(t-first) ... w(t-last); lag 0 is w(t) itself."""
         q, start = self.m + self.p, self.m if self.feedthrough else 0
         past = [start + (lag - 1) * q + np.arange(q) for lag in range(max(first, 1), last + 1)]
         return np.concatenate([np.r_[self.now_u, self.now_y], *past] if first == 0 else past)
 
 
 def complete_runs(u: Segments, y: Segments) -> list[np.ndarray]:
-    """The stretches w = [u, y] (L, m+p) of the segments in which nothing is masked."""
+    """Returns the stretches w = [u, y] (L, m+p) of the segments in which nothing is masked."""
     runs = []
     for a, b in zip(u, y, strict=True):
         w = np.hstack([a, b])
@@ -64,8 +64,8 @@ def complete_runs(u: Segments, y: Segments) -> list[np.ndarray]:
 
 
 def gapless(u: Segments, y: Segments) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The segments cut where an input is masked: no plant can be run over an unknown input. Pieces of one
-    sample, or without a single y, are dropped."""
+    """Returns the segments cut where an input is masked, because no plant can be simulated with an unknown
+    input. Pieces of one sample, or without a single y, are dropped."""
     us, ys = [], []
     for a, b in zip(u, y, strict=True):
         edges = np.flatnonzero(np.diff(np.r_[0, np.isfinite(a).all(axis=1), 0]))
@@ -77,10 +77,11 @@ def gapless(u: Segments, y: Segments) -> tuple[list[np.ndarray], list[np.ndarray
 
 
 def lagged_moments(w: np.ndarray, past: int) -> np.ndarray:
-    """Sum over t = past..L-1 of z z', z = [w(t); w(t-1); ...; w(t-past)], for w (L, q).
+    """Returns the sum over t = past..L-1 of z z', z = [w(t); w(t-1); ...; w(t-past)], for w (L, q).
 
     Only the first block row is a product over the samples; the rest follows from the shift
-    S(i+1, j+1) = S(i, j) + w(past-1-i) w(past-1-j)' - w(L-1-i) w(L-1-j)'.
+
+    S(i+1, j+1) = S(i, j) + w(past-1-i) w(past-1-j)' - w(L-1-i) w(L-1-j)'
     """
     L, q = w.shape
     S = np.empty((past + 1, q, past + 1, q))
@@ -100,7 +101,7 @@ def lagged_moments(w: np.ndarray, past: int) -> np.ndarray:
 
 
 def _columns(m: int, p: int, past: int, feedthrough: bool) -> np.ndarray:
-    """Order of the columns of `Lagged` taken from z = [w(t); w(t-1); ...]."""
+    """Returns the order of the columns of `Lagged`, as indices into z = [w(t); w(t-1); ...]."""
     q = m + p
     lags, now_u, now_y = np.arange(q, q * (past + 1)), np.arange(m), np.arange(m, q)
     return np.concatenate([now_u, lags, now_y] if feedthrough else [lags, now_u, now_y])
@@ -115,12 +116,12 @@ def lagged(
     offset: bool = True,
     exact: bool = False,
 ) -> Lagged:
-    """The triangular factor of a record. An offset is estimated with every regression (Frisch-Waugh: the
-    moments are taken about the mean of the same rows).
+    """Returns the triangular factor of a record. An offset is estimated with every regression (Frisch-Waugh:
+    the moments are taken about the mean of the same rows).
 
-    `exact` takes the QR of the rows themselves, for records whose noise is below the root of
-    rounding; otherwise Cholesky of the moments. Raises ValueError where no window of past + 1
-    complete samples is left, or fewer than there are unknowns.
+    `exact` uses the QR of the rows themselves, for records whose noise is below the root of rounding;
+    otherwise Cholesky of the moments is used. Raises ValueError if there are too few windows of past + 1
+    complete samples for the unknowns.
     """
     m, p = u[0].shape[1], y[0].shape[1]
     runs = [w for w in complete_runs(u, y) if len(w) > past]
@@ -148,7 +149,7 @@ def _moment_factor(runs, past, columns, mean, rows) -> np.ndarray:
     try:
         return np.linalg.cholesky(S / np.outer(scale, scale) + ROUNDING * np.eye(len(S))).T * scale
     except np.linalg.LinAlgError:
-        # a channel's movement is lost in the rounding of its mean: the rows themselves, with the same ridge
+        # a channel moves less than its mean rounds, so the rows themselves are used, with the same ridge
         return np.linalg.qr(
             np.vstack([_exact_factor(runs, past, columns, mean, rows), np.sqrt(ROUNDING) * np.diag(scale)]),
             mode="r",
@@ -161,10 +162,10 @@ def _exact_factor(runs, past, columns, mean, rows) -> np.ndarray:
 
 
 def one_step(data: Lagged, past: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients (features, p) of the one-step predictor with the first `past` lags (and u(t) with
-    feed-through), and its errors as rows of the factor."""
+    """Returns the coefficients (features, p) of the one-step predictor with the first `past` lags (and u(t)
+    with feed-through), and its errors as rows of the factor."""
     features = np.concatenate([data.now_u if data.feedthrough else [], data.lags(1, past)]).astype(int)
-    k = len(features)  # the features lead the columns, so the factor is already theirs
+    k = len(features)  # the features are the first columns, so the factor already belongs to them
     if data.exact:
         coefficients = np.linalg.lstsq(data.R[:, features], data.R[:, data.now_y], rcond=RANK)[0]
     else:
@@ -173,13 +174,13 @@ def one_step(data: Lagged, past: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def subspace(data: Lagged, future: int) -> tuple[np.ndarray, np.ndarray]:
-    """PBSID-opt (Chiuso 2007): the predictor's coefficients shifted into Gamma_f K, weighted by the noise,
-    times the past; by its singular value decomposition the basis with states = basis[:n] z for order n, and
-    all singular values in units of noise.
+    """Returns the basis of PBSID-opt (Chiuso 2007), with states = basis[:n] z for order n, and all singular
+    values in units of noise. Both come from the singular value decomposition of the predictor's coefficients,
+    shifted into Gamma_f K and weighted by the noise, times the past.
 
     Row block i holds the coefficients of lags i+1, i+2, ... : the effect that the past still has i steps
-    ahead. The coefficients' error adds to the singular values about as much as a (future p) x (past (m+p))
-    matrix of unit noise does, at most sqrt(future p) + sqrt(past (m+p)).
+    ahead. The error of the coefficients adds about as much to the singular values as a (future p) x (past
+    (m+p)) matrix of unit noise does, at most sqrt(future p) + sqrt(past (m+p)).
     """
     q, p, past = data.m + data.p, data.p, data.past
     coefficients, errors = one_step(data, past)
@@ -199,8 +200,8 @@ def subspace(data: Lagged, future: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _least_squares(regressors: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Theta with target = regressors Theta'; columns are scaled first,
-    so that the rank test does not depend on units."""
+    """Returns Theta with target = regressors Theta'. Columns are scaled first, so that the rank test does not
+    depend on units."""
     scale = np.linalg.norm(regressors, axis=0)
     scale[scale == 0] = 1.0
     return (np.linalg.lstsq(regressors / scale, target, rcond=RANK)[0] / scale[:, None]).T
@@ -209,10 +210,10 @@ def _least_squares(regressors: np.ndarray, target: np.ndarray) -> np.ndarray:
 def realise(
     data: Lagged, basis: np.ndarray, sample_time_s: float, direct: Sequence[bool] | None = None
 ) -> Plant:
-    """The plant whose states are basis (n, past (m+p)) times the past: C, D from y, then A, B, K from the
-    states one step later, all by least squares.
+    """Returns the plant whose states are basis (n, past (m+p)) times the past: C, D from y, then A, B, K from
+    the states one step later, all by least squares.
 
-    `direct` (p,) marks the outputs with a row of D, all where None, in a record factored with feed-through.
+    `direct` (p,) marks the outputs with a row of D in a record factored with feed-through; None marks all.
     """
     n, m = len(basis), data.m
     x, x_next = data.R[:, data.lags(1, data.past)] @ basis.T, data.R[:, data.lags(0, data.past - 1)] @ basis.T
@@ -223,7 +224,7 @@ def realise(
         proper = ~np.asarray(direct, bool)
         C[proper], D[proper] = _least_squares(x, y[:, proper]), 0.0
     if data.exact:
-        # errors are rounding and tell nothing of K: the window's own predictor has the gain of y(t-1)
+        # errors are rounding and do not determine K; the window's own predictor has the gain of y(t-1)
         AB = _least_squares(np.hstack([x, u]), x_next)
         A, B, K = AB[:, :n], AB[:, n:], basis[:, m : m + data.p]
     else:

@@ -1,6 +1,6 @@
-"""How far an identified plant can be trusted, on the part of the record that did not choose it: fits beside
-what they must beat, residual tests, excitation, step responses and poles with bands by bootstrap, as figures
-and as columns; and a sentence of advice for each test that failed."""
+"""Tests how far an identified plant can be trusted, on the part of the record that was not used to choose it:
+fits beside the reference that they must beat, residual tests, excitation, and step responses and poles with
+bands by bootstrap, as figures and as columns. Gives a sentence of advice for each test that failed."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -26,26 +26,25 @@ from pipeline.temperature.identification.refinement import (
 from pipeline.temperature.identification.subspace import Segments, lagged, realise, subspace
 from pipeline.temperature.plant import Plant, markov_parameters
 
-RESAMPLED_STEPS = (
-    1  # of Gauss-Newton a resampled record: from a consistent start one is efficient (Le Cam 1956)
-)
+# Gauss-Newton steps for a resampled record: from a consistent start one is efficient (Le Cam 1956)
+RESAMPLED_STEPS = 1
 QUANTILE_99 = 2.5758  # of the standard normal, two-sided
-# Quarters: of 20 simulated machines, 90 % bands of gains held the truth in 98 % in white noise, 88 % beside a
-# drift and 96 % where it also hides an input that hardly moved. Eighths are short beside a drift: 98, 80 and
-# 94 %. The bootstrap alone: 81, 54 and 64 %
+# Measured on 20 simulated machines: with quarters, 90 % bands of gains contained the true gain in 98 % of
+# cases in white noise, 88 % with a drift, and 96 % if the drift also hides an input that hardly moved. With
+# eighths: 98, 80 and 94 %, too few with a drift. With the bootstrap alone: 81, 54 and 64 %
 LEFT_OUT_BLOCKS = 4
-# errors of one step below this share of the output's movement are rounding: what colour they have is the
-# processor's, and no record of a sensor comes near (float32 resolves 1e-7)
+# one-step errors below this share of the output's movement are rounding: their correlation comes from the
+# processor, and no sensor's record is so exact (float32 resolves 1e-7)
 ROUNDING = 1e-8
-ADDS = 0.1  # of the error: what the inputs must take off that of the free response for a fit to be theirs
+ADDS = 0.1  # share by which the inputs must lower the error of the free response to explain a fit
 
 
 class Residuals(NamedTuple):
     """Residual tests at 99 %: autocorrelation (p, lags+1), cross-correlation with each input (p, m, 2 lags+1)
     at lags -lags..lags (positive: input first).
 
-    band and cross_band are what an ideal residual stays under; whiteness is Ljung and Box's statistic for
-    each output.
+    band and cross_band: limits of the correlations of an ideal residual; whiteness: Ljung and Box's statistic
+    for each output.
     """
 
     autocorrelation: np.ndarray
@@ -58,8 +57,9 @@ class Residuals(NamedTuple):
 
 
 class RecordExcitation(NamedTuple):
-    """Rank and condition of the covariance of `past` lags of all inputs (each scaled to unit power), and of
-    each input alone; full is the rank wanted."""
+    """Rank and condition number of the covariance of `past` lags of all inputs (each scaled to unit power),
+    and the rank for each input alone. full: the rank required; levels (m,): standard deviation of each
+    input."""
 
     rank: int
     full: int
@@ -69,11 +69,11 @@ class RecordExcitation(NamedTuple):
 
 
 def predicted_ahead(plant: Plant, u: np.ndarray, y: np.ndarray, steps: int) -> np.ndarray:
-    """ŷ(t | outputs up to t - steps) (T, p), inputs known throughout.
+    """Returns ŷ(t | outputs up to t - steps) (T, p), with inputs known throughout.
 
-    The state, disturbances in it included, comes from the Kalman predictor on past outputs only. It starts at
-    the one that fits the first max(3 n, 30) one-step predictions; callers leave these rows out of a score.
-    NaN in y passes as a missing measurement.
+    The state, with its disturbances, comes from the Kalman predictor on past outputs only. It starts from the
+    state that fits the first max(3 n, 30) one-step predictions; callers leave these rows out of a score. NaN
+    in y counts as a missing measurement.
     """
     model, first = prediction_form(plant, []), max(3 * plant.n, 30)
     begun = np.where(np.isfinite(y[:first]), y[:first], np.nanmean(y[:first], axis=0))
@@ -87,7 +87,7 @@ def predicted_ahead(plant: Plant, u: np.ndarray, y: np.ndarray, steps: int) -> n
 
 
 def _correlation(a: np.ndarray, b: np.ndarray, lag: int) -> float:
-    """Mean of a(t) b(t - lag) over the pairs that exist; both about zero mean and of unit power."""
+    """Returns the mean of a(t) b(t - lag) over the pairs that exist. Both have zero mean and unit power."""
     x, z = (a[lag:], b[: len(b) - lag]) if lag >= 0 else (a[:lag], b[-lag:])
     return float(np.nanmean(x * z))
 
@@ -95,14 +95,14 @@ def _correlation(a: np.ndarray, b: np.ndarray, lag: int) -> float:
 def residual_tests(
     plant: Plant, u: Segments, y: Segments, *, lags: int = 25, closed: bool = False
 ) -> Residuals:
-    """Whiteness of the one-step errors and their independence of past
-    inputs (Ljung 1999, section 16.6), both at 99 %.
+    """Tests the whiteness of the one-step errors and their independence of past inputs (Ljung 1999, section
+    16.6), both at 99 %.
 
-    Whiteness is Ljung and Box's test. Independence fails where a correlation at a lag from 0 on leaves the
-    band widened for the number of lags (Bonferroni); correlation at negative lags only says that the record
-    was taken in closed loop. There (`closed`) lag 0 says so too, as u(t) answers the error of y(t), and the
-    test begins at lag 1. Errors below `ROUNDING` of an output's movement count as none. Raises ValueError
-    where the record has fewer than 4 lags of samples.
+    Whiteness is Ljung and Box's test. Independence fails if the correlation at a lag of 0 or more leaves the
+    band, widened for the number of lags (Bonferroni). Correlation at negative lags only shows that the record
+    was taken in closed loop. In closed loop (`closed`) lag 0 shows that too, because u(t) responds to the
+    error of y(t), so the test begins at lag 1. Errors below `ROUNDING` of an output's movement count as none.
+    Raises ValueError if the record has fewer than 4 lags of samples.
     """
     if sum(len(a) for a in u) < 4 * lags:
         raise ValueError(
@@ -136,8 +136,9 @@ def residual_tests(
 
 
 def excitation(u: Segments, past: int) -> RecordExcitation:
-    """Rank and condition of the lagged inputs, and of each alone, about their mean; levels (m,) is the
-    standard deviation of each input."""
+    """Returns rank and condition number of the lagged inputs together, and the rank of each alone, about
+    their mean; levels (m,): standard deviation of each input. Raises ValueError if no segment has past + 1
+    complete samples."""
     complete = [a for a in u if np.isfinite(a).all() and len(a) > past]
     if not complete:
         raise ValueError(
@@ -170,16 +171,17 @@ def bootstrap_spread(
     order: int | None = None,
     rng: np.random.Generator,
 ) -> list[Plant]:
-    """`count` plants re-identified on records rebuilt from block-resampled one-step errors (Kuensch 1989),
-    each with finite poles inside the unit circle.
+    """Returns `count` plants identified on records rebuilt from block-resampled one-step errors (Kuensch
+    1989). Every pole is finite and inside the unit circle.
 
     The record is rebuilt under the recorded inputs by
 
     x(t+1) = A x + B u + b + K e*
     y* = C x + D u + d + e*
 
-    Blocks are two windows long, so that colour that the model missed is kept. `order` (without delays) may
-    differ from the identified one, to give plants that no controller was designed on.
+    Blocks are two windows long, so that correlation that the model missed is kept. `order` (without delays)
+    may differ from the identified one, to give plants on which no controller was designed. Raises ValueError
+    if u has NaN.
     """
     plant, past, block_errors = (
         stabilised(identified.plant, LARGEST_RADIUS),
@@ -207,12 +209,12 @@ def bootstrap_spread(
 
 
 def left_out_plants(u: Segments, y: Segments, identified, *, blocks: int = LEFT_OUT_BLOCKS) -> list[Plant]:
-    """The identified class of model fitted anew `blocks` times, each without one equal block of the record's
-    samples; none where what is left is too short for the window. A block without which some input hardly
-    moves on its own is passed over: what is left does not tell its effect.
+    """Fits the identified model class `blocks` times, each time without one equal block of the record's
+    samples. Returns none if the rest is too short for the window. A block is skipped if some input hardly
+    moves on its own without it, because the rest then does not show its effect.
 
-    Their spread holds what a bootstrap under the model cannot: drift, and what no linear model has (the
-    jackknife of a block, Kuensch 1989).
+    Their spread shows what a bootstrap under the model cannot: drift, and effects outside any linear model
+    (block jackknife, Kuensch 1989).
     """
     ends = np.cumsum([len(a) for a in u])
     edges = np.linspace(0, ends[-1], blocks + 1).round().astype(int)
@@ -231,13 +233,13 @@ def left_out_plants(u: Segments, y: Segments, identified, *, blocks: int = LEFT_
             continue
         try:
             plants.append(_reidentified(left_u, left_y, identified, identified.order))
-        except ValueError:  # what is left of the record is too short
+        except ValueError:  # the rest of the record is too short
             return []
     return plants
 
 
 def _still_moves(left: Segments, u: Segments) -> bool:
-    """Whether the least independent movement of the inputs that are left is above a thousandth of that of
+    """Returns whether the least independent movement of the remaining inputs is above a thousandth of that of
     all of u."""
     whole, part = np.vstack(u), np.vstack(left)
     scale = np.maximum(whole.std(axis=0), np.finfo(float).tiny)
@@ -260,16 +262,16 @@ def _reidentified(u: Segments, y: Segments, identified, order: int) -> Plant:
 
 
 def step_response(plant: Plant, steps: int) -> np.ndarray:
-    """Response (steps, p, m) of each output to a unit step of each input from
-    rest, without offsets: D, then D + C B + C A B + ..."""
+    """Returns the response (steps, p, m) of each output to a unit step of each input from rest, without
+    offsets: D, then D + C B + C A B + ..."""
     return plant.D + np.concatenate(
         [np.zeros((1, plant.p, plant.m)), np.cumsum(markov_parameters(plant, steps - 1), axis=0)]
     )
 
 
 def steady_gain(plant: Plant) -> np.ndarray:
-    """D + C (I - A)^-1 B (p, m): what the outputs settle at after a unit step of each input. A must have no
-    pole at 1."""
+    """Returns D + C (I - A)^-1 B (p, m), the steady change of the outputs after a unit step of each input. A
+    must have no pole at 1."""
     return plant.D + plant.C @ np.linalg.solve(np.eye(plant.n) - plant.A, plant.B)
 
 
@@ -281,11 +283,11 @@ def spread_bands(
     level: float = 0.99,
     left_out: Sequence[Plant] = (),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Step responses (steps, p, m) of the nominal plant, and the low and high ends of their bands at `level`
-    over a family of plants; with few members the band is their range.
+    """Returns the step responses (steps, p, m) of the nominal plant, and the low and high ends of their bands
+    at `level` over a family of plants. If the family is small, the band is its range.
 
-    They reach at least as far as Student's quantile of the jackknife's deviation over the `left_out` plants
-    (`left_out_plants`), where there are any.
+    If there are `left_out` plants (`left_out_plants`), the bands reach at least to Student's quantile of
+    their jackknife deviation.
     """
     own, *rest = (step_response(plant, steps) for plant in (nominal, *family, *left_out))
     return own, *banded(own, rest[: len(family)], rest[len(family) :], level)
@@ -294,8 +296,8 @@ def spread_bands(
 def banded(
     own: np.ndarray, family: Sequence[np.ndarray], left_out: Sequence[np.ndarray], level: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high ends (...) of a quantity `own` (...) of the plant, from those of a family and of plants
-    without a block, as `spread_bands` says."""
+    """Returns low and high ends (...) of a quantity `own` (...) of the plant, from those of a family and of
+    plants without a block, as in `spread_bands`."""
     low, high = np.quantile(np.stack(family), [(1 - level) / 2, (1 + level) / 2], axis=0)
     blocks = len(left_out)
     if blocks > 1:
@@ -315,11 +317,11 @@ def advice(
     still_percent: np.ndarray | None = None,
     order_given: bool = False,
 ) -> list[str]:
-    """A sentence for each kind of test that failed: what was seen, where most, and what to do about it. Empty
-    where everything passed.
+    """Returns a sentence for each kind of test that failed: what was found, where it is strongest, and what
+    to do. Empty if everything passed.
 
-    `still_percent` (p,) is the fit with the inputs held. An order that was not given is no remedy: the rules
-    chose it.
+    `still_percent` (p,): fit with constant inputs. A higher order is a remedy only if the order was given
+    (`order_given`); otherwise the rules chose it.
     """
     sentences = _of_colour(tests, outputs, order_given) + _of_inputs_left(tests, outputs, inputs, order_given)
     for o, output in enumerate(outputs):
@@ -329,7 +331,7 @@ def advice(
                 "the model misses more than half of its movement; "
                 "look for an input or disturbance that is not recorded"
             )
-        # the recorded inputs take less than `ADDS` off the error of the free response
+        # the recorded inputs lower the error of the free response by less than `ADDS`
         if still_percent is not None and 100.0 - fit_percent[o] > (1.0 - ADDS) * (100.0 - still_percent[o]):
             sentences.append(
                 f"the fit of {output} on the hold-out, {fit_percent[o]:.0f} %, is that of the free response "
@@ -354,7 +356,7 @@ def advice(
 
 
 def _of_colour(tests: Residuals, outputs: Sequence[str], order_given: bool) -> list[str]:
-    """What the residuals show that are not white, the most coloured output named."""
+    """Returns advice on residuals that are not white, with the name of the most coloured output."""
     failed = np.flatnonzero(~tests.whiteness_passed)
     if not failed.size:
         return []
@@ -375,7 +377,7 @@ def _of_colour(tests: Residuals, outputs: Sequence[str], order_given: bool) -> l
 def _of_inputs_left(
     tests: Residuals, outputs: Sequence[str], inputs: Sequence[str], order_given: bool
 ) -> list[str]:
-    """What inputs leave in the residuals, the strongest pair named."""
+    """Returns advice on residuals that depend on inputs, with the strongest pair."""
     failed, lags = ~tests.independence_passed, tests.autocorrelation.shape[1] - 1
     if not failed.any():
         return []
@@ -393,20 +395,20 @@ def _of_inputs_left(
     ]
 
 
-LEVEL = 0.9  # of every band here
+LEVEL = 0.9  # of every band from here on
 ENDS = ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
 
 
 class Holdout(NamedTuple):
-    """What held-out segments say of a plant.
+    """Results of a plant on held-out segments.
 
-    simulated, ahead: predictions (T, p) of each segment, the second NaN over its start-up. fits: by the name
-    of the figure, (3, p) in percent, value and the ends of its 90 % band, of the simulation
-    (`fit_holdout`); of the predictions ahead (`..._ahead`), NaN where no segment outlasts the start-up; of
-    the last value seen so many steps before, held, over the same rows (`..._held`); of the simulation with
-    the mean of each segment's error taken off (`..._free_mean`), what another ambient alone would cost: its
-    start is the simulation's, as one fitted beside a free mean lets slow modes draw any ramp; and of the
-    simulation with a drift tracked up to so many steps before (`..._drift`), NaN without one.
+    simulated, ahead: predictions (T, p) of each segment, the second NaN over its start-up. fits: by name of
+    the figure, (3, p) in percent: value and the ends of its 90 % band. `fit_holdout`: of the simulation.
+    `..._ahead`: of the predictions ahead; NaN if no segment outlasts the start-up. `..._held`: of the last
+    measured value so many steps before, over the same rows. `..._free_mean`: of the simulation with the mean
+    of each segment's error removed; the difference to `fit_holdout` is the cost of another ambient alone. It
+    starts as the simulation does, because a start fitted together with a free mean lets slow modes follow any
+    ramp. `..._drift`: of the simulation with a drift tracked up to so many steps before; NaN without a drift.
     """
 
     simulated: list[np.ndarray]
@@ -415,14 +417,14 @@ class Holdout(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Responses to unit steps, beside their bands over a family of
-    plants: response, low, high (K, p, m) at samples (K,).
+    """Responses to unit steps with their bands over a family of plants: response, low, high (K, p, m) at
+    samples (K,).
 
-    first_order: models of the plant's responses and the family's, (1 + family, p, m).
-    gain, peak, time_constant, delay (3, p, m): value and the ends of its band. gain is the steady value, or
-    the last one of a plant that is an integrator to the record; peak is the largest excursion at samples.
-    Times are in samples, NaN where `significant` (p, m) is False: the band of the peak holds zero, so that
-    not even the sign of the effect is known.
+    first_order: models of the plant's responses and the family's, (1 + family, p, m). gain, peak,
+    time_constant, delay (3, p, m): value and the ends of its band. gain is the steady value, or the last
+    value if the plant is an integrator to the record; peak is the largest excursion at samples. Times are in
+    samples. They are NaN if `significant` (p, m) is False: the band of the peak includes zero, so that not
+    even the sign of the effect is known.
     """
 
     samples: np.ndarray
@@ -438,8 +440,8 @@ class Steps(NamedTuple):
 
 
 def held(y: np.ndarray, steps: int) -> np.ndarray:
-    """The last value of y (T, p) seen at or before t - steps, NaN before there is
-    one: what a prediction `steps` ahead must beat."""
+    """Returns the last value of y (T, p) measured at or before t - steps, NaN before the first one. A
+    prediction `steps` ahead must beat it."""
     last = np.maximum.accumulate(np.where(np.isfinite(y), np.arange(len(y))[:, None], -1), axis=0)
     late = np.vstack([np.full((steps, y.shape[1]), -1), last])[: len(y)]
     return np.where(late >= 0, np.take_along_axis(y, np.maximum(late, 0), axis=0), np.nan)
@@ -448,11 +450,11 @@ def held(y: np.ndarray, steps: int) -> np.ndarray:
 def fit_with_band(
     y: Segments, predicted: Segments, *, block: int, rng: np.random.Generator, draws: int = 400
 ) -> np.ndarray:
-    """NRMSE (3, p) in percent over the samples where both are seen: value, and the ends of its 90 % band by
-    resampling blocks of samples (Kuensch 1989).
+    """Returns the NRMSE fit (3, p) in percent over the samples at which both are finite: value, and the ends
+    of its 90 % band by resampling blocks of samples (Kuensch 1989).
 
-    Blocks of `block` samples keep the colour of the errors; they are shortened where
-    fewer than ten fit, and joined where more than 200 do.
+    Blocks of `block` samples keep the correlation of the errors. They are shortened if fewer than ten fit,
+    and joined if more than 200 do.
     """
     y, predicted = np.vstack(y), np.vstack(predicted)
     mask = np.isfinite(y) & np.isfinite(predicted)
@@ -480,8 +482,8 @@ def holdout(
     rng: np.random.Generator,
     drift: float = 0.0,
 ) -> Holdout:
-    """Simulation and prediction `steps` ahead of held-out segments, beside holding the last value; `block` as
-    in `fit_with_band`, `drift` the rate of an identified one."""
+    """Simulates held-out segments and predicts them `steps` ahead, beside the last measured value. `block` as
+    in `fit_with_band`; `drift`: rate of an identified drift, 0 for none."""
     simulations = [simulated(plant, a, b) for a, b in zip(u, y, strict=True)]
     skip, ahead = max(3 * plant.n, 30) + steps, []  # the start-up of `predict_fit`
     for a, b in zip(u, y, strict=True):
@@ -508,32 +510,33 @@ def holdout(
 
 
 def fit_of_held_inputs(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
-    """NRMSE (p,) in percent of the free response alone: every input held at its mean in each segment, the
-    initial state fitted as in `simulated`."""
+    """Returns the NRMSE fit (p,) in percent of the free response alone: every input constant at its mean in
+    each segment, with the initial state fitted as in `simulated`."""
     free = [simulated(plant, np.broadcast_to(a.mean(axis=0), a.shape), b) for a, b in zip(u, y, strict=True)]
     return fit_with_band(y, free, block=1, rng=np.random.default_rng(0), draws=1)[0]
 
 
 def _mean_removed(y: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """The prediction moved by the mean of its error, output by output."""
+    """Returns the prediction shifted by the mean of its error, output by output."""
     seen = np.isfinite(y)
     error = np.where(seen, y - predicted, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     return predicted + error
 
 
 def residual_lags(u: Segments) -> int:
-    """As many lags as `residual_tests` can carry, at most 25."""
+    """Returns the number of lags that `residual_tests` can use, at most 25."""
     return max(min(25, sum(map(len, u)) // 4), 1)
 
 
 def horizon(plant: Plant, longest: int) -> int:
-    """Samples until every step response stays within 5 % of its
-    output's largest one, and a third more; at most `longest`.
+    """Returns the samples until every step response stays within 5 % of its output's largest one, and a third
+    more; at most `longest`.
 
-    Of a plant with a pole outside the unit circle, three of its time constants: later there is nothing else
-    to see. A mode whose time constant is longer than `longest`, the record, is an integrator to it, and is
-    followed over a tenth: the record shows ten such stretches, and of one as long as itself no sign (of the
-    study's plant, 16 of 35 signs at one and 1 of them wrong, 22 at the other and none).
+    For a plant with a pole outside the unit circle, it is at most three of its time constants, because
+    nothing else is visible later. A mode whose time constant is longer than `longest`, the record, is an
+    integrator to the record, and is followed over a tenth of it. The record contains ten such stretches, but
+    only one of its own length, too few to show a sign. Of 35 signs of the study's plant, 22 were certain over
+    a tenth, none of them wrong, and 16 over the whole length, 1 of them wrong.
     """
     radius = np.abs(np.linalg.eigvals(plant.A)).max()
     if not _settles(plant, longest):
@@ -545,17 +548,16 @@ def horizon(plant: Plant, longest: int) -> int:
 
 
 def _settles(plant: Plant, longest: int) -> bool:
-    """Whether every mode decays, or grows, by 63 % within `longest` samples: others are integrators to a
-    record of that length."""
+    """Returns whether every mode decays, or grows, by 63 % within `longest` samples. Other modes are
+    integrators to a record of that length."""
     radius = np.abs(np.linalg.eigvals(plant.A)).max()
     return bool(abs(np.log(max(radius, np.finfo(float).tiny))) * longest >= 1)
 
 
 def two_points(responses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Time constant 1.5 (t63 - t28) and delay t63 - tau (p, m), in samples, of responses (T,
-    p, m) (Smith 1972); t28 and t63 are when 28.3 and 63.2 % of the largest excursion are
-    first reached, between samples by a straight line.
-    """
+    """Returns time constant 1.5 (t63 - t28) and delay t63 - tau (p, m), in samples, of responses (T, p, m)
+    (Smith 1972). t28 and t63 are the times at which 28.3 and 63.2 % of the largest excursion are first
+    reached, interpolated linearly between samples."""
     peak = np.take_along_axis(responses, np.abs(responses).argmax(axis=0)[None], axis=0)[0]
     share = responses / np.where(peak == 0, 1.0, peak)
 
@@ -580,8 +582,8 @@ def steps(
     points: int = 120,
     left_out: Sequence[Plant] = (),
 ) -> Steps:
-    """Step responses of a plant over its `horizon`, at most `points` + 1 of each, with gain, peak, time
-    constant and delay, beside the family's; `left_out` as in `spread_bands`."""
+    """Returns the step responses of a plant over its `horizon`, at most `points` + 1 of each, with gain,
+    peak, time constant and delay, and those of the family; `left_out` as in `spread_bands`."""
     samples = horizon(nominal, longest)
     bands = spread_bands(nominal, family, samples + 1, level=LEVEL, left_out=left_out)
     at = np.abs(bands[0]).argmax(axis=0)[None]
@@ -596,13 +598,13 @@ def steps(
     times = np.where(significant, np.concatenate([shapes[:1], np.quantile(shapes[1:], ENDS, axis=0)]), np.nan)
     grid = np.arange(0, samples + 1, -(-samples // points))
     response, low, high = (part[grid] for part in bands)
-    # equal ratios: what a controller meets first counts as much as what a drift does in the end
+    # equal ratios: the start, which matters to a controller, counts as much as a late drift
     ratios = np.unique(np.geomspace(1, samples, points).round().astype(int))
     models = of_step_responses(ratios, np.stack([part[ratios] for part in responses], axis=1))
     return Steps(grid, response, low, high, gain, peak, times[:, 0], times[:, 1], significant, models)
 
 
-# no heated part outlives it: an input whose whole range moves an output by more was not identified
+# no heated part survives it: if an input's whole range moves an output by more, the gain is wrong
 LARGEST_RISE_DEGC = 2000.0
 
 
@@ -613,9 +615,10 @@ def forbidden_gains(
     heats: Sequence[bool],
     ranges: Sequence[float],
 ) -> list[dict[str, Any]]:
-    """The steady effects that physics forbids, of inputs that `heats` marks: negative ones, and those that
-    over the input's range (percent) are larger than `LARGEST_RISE_DEGC`. `gain` in °C per percent with its
-    band, and why; `certain`: the whole band is forbidden, not the value alone."""
+    """Returns the steady effects that are physically impossible, for inputs marked in `heats`: negative ones,
+    and those that are larger than `LARGEST_RISE_DEGC` over the input's range (percent). Each has its `gain`
+    in °C per percent with its band, and a reason; `certain`: the whole band is impossible, not only the
+    value."""
     flagged = []
     for j, name in enumerate(inputs):
         for o, output in enumerate(outputs if heats[j] else ()):
@@ -639,8 +642,8 @@ def forbidden_gains(
 
 
 def input_levels(u: Segments, *, bands: int = 8) -> np.ndarray:
-    """R.m.s. level (bands, m) of each input within equal bands from 0 to pi rad a sample, over the segments
-    of at least four samples a band."""
+    """Returns the r.m.s. level (bands, m) of each input within equal bands from 0 to pi rad a sample, over
+    the segments with at least four samples per band."""
     power, samples = np.zeros((bands, u[0].shape[1])), 0
     for a in u:
         if len(a) >= 4 * bands:
@@ -658,7 +661,7 @@ def input_levels(u: Segments, *, bands: int = 8) -> np.ndarray:
 def holdout_rows(
     measured: Segments, predictions: Holdout, outputs: Sequence[str], sample_time_s: float
 ) -> dict[str, np.ndarray]:
-    """Measured, simulated and predicted outputs of the held-out segments."""
+    """Returns measured, simulated and predicted outputs of the held-out segments."""
     columns = {
         "segment": np.repeat(np.arange(len(measured), dtype=np.int32), [len(y) for y in measured]),
         "time_s": np.concatenate([sample_time_s * np.arange(len(y)) for y in measured]),
@@ -672,8 +675,8 @@ def holdout_rows(
 
 
 def residual_rows(tests: Residuals, outputs: Sequence[str], inputs: Sequence[str]) -> dict[str, list]:
-    """Every correlation with its 99 % band: of each output's residuals
-    with themselves, then with each input."""
+    """Returns every correlation with its 99 % band: each output's residuals with themselves, then with each
+    input."""
     lags, table = tests.autocorrelation.shape[1] - 1, []
     for o, output in enumerate(outputs):
         table += [
@@ -697,7 +700,7 @@ def residual_rows(tests: Residuals, outputs: Sequence[str], inputs: Sequence[str
 def step_rows(
     steps: Steps, outputs: Sequence[str], inputs: Sequence[str], sample_time_s: float
 ) -> dict[str, np.ndarray | list]:
-    """The responses of `steps`, input by input within output by output."""
+    """Returns the responses of `steps`, output by output, and within an output input by input."""
     pairs, count = [(o, j) for o in range(len(outputs)) for j in range(len(inputs))], len(steps.samples)
     columns = {
         "output": [outputs[o] for o, _ in pairs for _ in range(count)],
@@ -713,7 +716,7 @@ def step_rows(
 def dynamics_rows(
     steps: Steps, outputs: Sequence[str], inputs: Sequence[str], sample_time_s: float
 ) -> dict[str, np.ndarray | list]:
-    """Gain, peak, time constant and delay of `steps`, in the same order."""
+    """Returns gain, peak, time constant and delay of `steps`, in the same order."""
     columns = {
         "output": [name for name in outputs for _ in inputs],
         "input": [*inputs] * len(outputs),
@@ -732,8 +735,8 @@ def dynamics_rows(
 def first_order_rows(
     steps: Steps, outputs: Sequence[str], inputs: Sequence[str], sample_time_s: float
 ) -> dict[str, np.ndarray | list]:
-    """A first-order model with delay for every pair, in the order of `step_rows`, with bands over the family,
-    and the PID that SIMC makes of it; missing where not even the sign of its gain is known."""
+    """Returns a first-order model with delay for every pair, in the order of `step_rows`, with bands over the
+    family, and its PID by SIMC. Values are missing if not even the sign of the gain is known."""
     models, columns = steps.first_order, {"output": [o for o in outputs for _ in inputs]}
     columns |= {"input": [*inputs] * len(outputs)}
     banded = [
@@ -754,10 +757,10 @@ def first_order_rows(
 
 
 def pole_rows(nominal: Plant, family: Sequence[Plant]) -> dict[str, np.ndarray]:
-    """Poles of the plant (member 0), largest first, and of a family; `pole` is the number of the plant's pole
-    that each belongs to, -1 for one too many.
+    """Returns the poles of the plant (member 0), largest first, and of a family. `pole` is the number of the
+    corresponding pole of the plant, -1 if there is none.
 
-    Poles belong together where the sum of their distances is least (Kuhn 1955).
+    Poles are matched so that the sum of their distances is smallest (Kuhn 1955).
     """
     mine = np.linalg.eigvals(nominal.A)
     mine = mine[np.lexsort((-mine.imag, -np.abs(mine).round(12)))]
@@ -778,7 +781,7 @@ def pole_rows(nominal: Plant, family: Sequence[Plant]) -> dict[str, np.ndarray]:
 
 
 def level_rows(levels: np.ndarray, inputs: Sequence[str]) -> dict[str, np.ndarray | list]:
-    """The levels of `input_levels`, band by band within input by input."""
+    """Returns the levels of `input_levels`, input by input, and within an input band by band."""
     edges = np.linspace(0, np.pi, len(levels) + 1)
     return {
         "input": [name for name in inputs for _ in levels],
@@ -792,8 +795,8 @@ def level_rows(levels: np.ndarray, inputs: Sequence[str]) -> dict[str, np.ndarra
 
 
 def fit_figures(judged: Holdout, outputs: Sequence[str]) -> dict[str, dict | None]:
-    """Fits on the hold-out by output, with their bands and what they must beat; those
-    ahead are None where no segment was long enough, that of a drift where there is none."""
+    """Returns the fits on the hold-out by output, with their bands and the references that they must beat.
+    Those ahead are None if no segment was long enough, those with drift if there is no drift."""
     banded = [f"fit_holdout{end}" for end in ("", "_free_mean", "_drift", "_ahead")]
     figures = {key: dict(zip(outputs, judged.fits[key][0].tolist(), strict=True)) for key in banded}
     figures |= {
@@ -806,7 +809,7 @@ def fit_figures(judged: Holdout, outputs: Sequence[str]) -> dict[str, dict | Non
 def outcome_figures(
     tests: Residuals, excited: RecordExcitation, outputs: Sequence[str], inputs: Sequence[str]
 ) -> dict[str, dict]:
-    """Which tests passed, and how far the inputs excite."""
+    """Returns which tests passed, and how far the inputs excite."""
     lags = excited.full // len(inputs)
     alone = {
         name: {"rank": int(rank), "level": float(level)}
@@ -836,8 +839,8 @@ def judge(
     ahead_steps: int,
     rng: np.random.Generator,
 ) -> tuple[Holdout, Residuals, RecordExcitation, np.ndarray]:
-    """The model that (u, y) of `first` chose, on (u, y) of `last`; what the first part excites; and the fit
-    (p,) of the model with the inputs held."""
+    """Judges the model that was chosen on (u, y) of `first`, on (u, y) of `last`. Returns the hold-out
+    results, the residual tests, the excitation of the first part, and the fit (p,) with constant inputs."""
     closed = chosen.feedback is not None and chosen.feedback.closed
     return (
         holdout(chosen.plant, *last, ahead_steps, block=2 * chosen.past, rng=rng, drift=chosen.drift),

@@ -1,5 +1,6 @@
-"""Costs of all cases and the limits of section `report` -> which controller of the temperature loop is best,
-and whether it still is without the plant that decides. The comparison itself knows no limit."""
+"""Chooses the best controller of the temperature loop from the costs of all cases and the limits of section
+`report`, and whether it is still the best without the plant that decides. The comparison itself has no
+limits."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,7 +9,7 @@ import numpy as np
 
 from pipeline.temperature.test_set.scorecard import chosen
 
-# limits that a simulation of the temperature loop can check, as the comparison resolves them
+# limits that a simulation of the temperature loop can check
 CHECKED = (
     "settled_error_degC",
     "peak_error_degC",
@@ -19,18 +20,18 @@ CHECKED = (
     "disk_margin",
     "delay_margin_s",
 )
-# controllers of one structure: of two that pass the one with the larger margins may be named
+# pairs of controllers of one structure: if both pass, only the one with the larger margins may be best
 SAME_STRUCTURE = (("pi_simc", "pi"),)
 
 
 def best_by_limits(
     compared: Mapping[str, Any], table: Mapping[str, np.ndarray], declared: Mapping[str, Any], seed: int
 ) -> dict[str, Any]:
-    """Of the figures of evaluate_temperature what a limit can change: `limits`, `best`, `best_reason`, in
-    `deciding` the best one without that plant, and `bears_less`: {name: the one of its structure that bears
-    more}.
+    """Returns those figures of evaluate_temperature that depend on the limits: `limits`, `best`,
+    `best_reason`, `deciding` with the best controller without that plant, and `bears_less`: {name: the more
+    robust controller of the same structure}.
 
-    `table` has the cases, one row a controller and case; `declared` has the limits of section `report`.
+    `table` has the cases, one row per controller and case; `declared` has the limits of section `report`.
     """
     order, limits = compared["order"], limits_of(compared["pace"], declared)
     able = {name: passes(compared["contestants"][name], limits) for name in order}
@@ -39,7 +40,7 @@ def best_by_limits(
     bears_less = {name: pair[1 - pair.index(name)] for name, pair in weaker.items() if name}
     eligible = {name: held and not able.get(bears_less.get(name, ""), False) for name, held in able.items()}
     rows = {name: table["contestant"] == name for name in order}
-    # a cost that is missing is without end
+    # a missing cost is infinite
     costs = {
         name: np.where(np.isnan(table["cost"][at]), np.inf, table["cost"][at]) for name, at in rows.items()
     }
@@ -66,8 +67,9 @@ def best_by_limits(
 
 
 def fragile(pair: tuple[str, str], figures: Mapping[str, Any], able: Mapping[str, bool]) -> str:
-    """Of two controllers of one structure that both pass, the one that bears less on the plant that a tenth
-    of all plants lie below, by the margin whose share of the other's is smaller; "" where only one passes."""
+    """Returns the less robust of two controllers of one structure that both pass; "" if not both pass.
+    Margins are compared at the 10 % quantile over the plants. The less robust controller has the smaller
+    ratio of its margin to the other's."""
     if not all(able.get(name, False) for name in pair):
         return ""
     ends = [figures[name]["margins"] for name in pair]
@@ -81,9 +83,9 @@ def fragile(pair: tuple[str, str], figures: Mapping[str, Any], able: Mapping[str
 
 
 def limits_of(pace: Mapping[str, Any], declared: Mapping[str, Any]) -> dict[str, Any]:
-    """The limits for this machine. `pace` has the settling time that counts if none is declared, to which the
-    shortest time from cold adds when it heats up, the share of the declared delay margin that is asked of a
-    fast machine, and in words where they come from."""
+    """Returns the limits for this machine. `pace` has the settling time that counts if none is declared, the
+    shortest time from cold, which is added to it for heating up, the share of the declared delay margin that
+    is required of a fast machine, and in words where they come from."""
     settling_s = declared["settling_s"] or pace["settling_s"]
     return {name: declared[name] for name in CHECKED} | {
         "settling_s": settling_s,
@@ -94,8 +96,9 @@ def limits_of(pace: Mapping[str, Any], declared: Mapping[str, Any]) -> dict[str,
 
 
 def passes(figures: Mapping[str, Any], limits: Mapping[str, Any]) -> bool:
-    """Whether a controller's figures hold the rules that a simulation can check, at the 90 % quantile over
-    all cases; stable on every plant, and margins of the one that a tenth of them lie below."""
+    """Returns whether a controller passes the limits that a simulation can check: its figures at the 90 %
+    quantile over all cases, stability on every plant, its margins, if it has any, at the 10 % quantile over
+    the plants, and no crossing of the output limits in any case."""
     quantiles = {
         "settled_error": limits["settled_error_degC"],
         "peak": limits["peak_error_degC"],

@@ -1,4 +1,4 @@
-"""The search for the parameters of one controller: every controller has the same search, budget and cost, on
+"""The search for the parameters of one controller. Every controller has the same search, budget and cost, on
 the same training half of the panel, as it would be deployed."""
 
 from collections.abc import Sequence
@@ -13,23 +13,24 @@ from pipeline.temperature.settings import TuneWeights
 from pipeline.temperature.test_set import panel, scorecard, tuning
 from pipeline.temperature.test_set.panel import CaseConditions, play
 
-# of a parameter's range, in logarithms: so near to an end the search is called bound by it
+# share of a parameter's range, in logarithms: a result this near to an end lies at a bound
 AT_BOUND = 0.02
-# of the cost, for a parameter moved from its start by its whole range: of two candidates as good as each
-# other the one nearer to the start is taken, so that a direction in which the cost is flat has one end
+# share of the cost added for a parameter that is its whole range away from its start: of two equally good
+# candidates the one nearer to the start is taken, so that the result is unique where the cost is flat
 NEARER = 0.05
-# of the candidates, the last, by a pattern search from the best: without it two seeds end 6 % apart
+# share of the candidates, the last ones, for a pattern search from the best: without it two seeds end 6 %
+# apart
 POLISHED = 1 / 3
 
 
 def search(
     name: str, settings: TuneWeights, problem: DesignProblem, setting: CaseConditions
 ) -> tuple[str, tuning.SearchResult | str]:
-    """The name and the best parameters of a controller; a sentence if it cannot be designed, an empty one if
-    the record does not allow it."""
+    """Returns the name of a controller and the result of its search. Instead of a result, returns a sentence
+    if it cannot be designed or every candidate fails, and an empty one if the record does not allow it."""
     controller = table.BY_NAME[name]
     low, start, high = table.bounds(controller, problem)
-    # a kernel may have no minimum at the start, and one where inputs cost more
+    # a kernel may have no minimum at the start, but one with a larger weight on inputs
     for theta in (start, np.sqrt(start * high), high):
         try:
             design = controller.design(problem, table.parameters(controller, theta))
@@ -64,14 +65,14 @@ def search(
             start=first,
         )
         return name, tuning.polished(cost, result, low, high, evaluations=last)
-    except ValueError as failure:  # every candidate failed: the others go on
+    except ValueError as failure:  # every candidate failed; other controllers continue
         return name, str(failure)
 
 
 def _cost(design: Design, rests: Sequence[Rest], settings: TuneWeights, setting: CaseConditions) -> float:
-    """The declared cost of a candidate. Raises ValueError if its margins on the plant that a tenth of the
-    training plants lie below are less than the least: figures in simulation are no reason to give robustness
-    away."""
+    """Returns the declared cost of a candidate. Raises ValueError if one of its margins, at the 10 % quantile
+    over the training plants, is below the least allowed. Better figures in simulation do not justify less
+    robustness."""
     training = setting.rehearsal.training
     margins = scorecard.margins(training.plants, design.law, grid=80)
     disk, delay_s = (
@@ -90,7 +91,8 @@ def _cost(design: Design, rests: Sequence[Rest], settings: TuneWeights, setting:
 
 
 def tuned_values(name: str, result: tuning.SearchResult, problem: DesignProblem) -> dict[str, Any]:
-    """The parameters by name, the weights that they stand for, the cost, and which of them lie at a bound."""
+    """Returns the parameters by name, the weights that follow from them, the cost, and which parameters lie
+    at a bound."""
     controller = table.BY_NAME[name]
     low, _, high = table.bounds(controller, problem)
     share = np.log(result.theta / low) / np.log(high / low)

@@ -1,5 +1,5 @@
-"""Controllers as they would be deployed, on plants that nobody learned or tuned on: figures of each, what
-tells model-based and data-driven apart, and which plant decides."""
+"""Evaluates controllers as they would be deployed, on plants that were not used for learning or tuning:
+figures of each, what separates model-based from data-driven, and which plant decides."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -32,12 +32,12 @@ CONVENTION = (
 )
 
 
-OF_SEARCH = ("at_bound", "evaluations", "cost", "cost_at_start", "failed", "q", "r")  # and no parameters
+OF_SEARCH = ("at_bound", "evaluations", "cost", "cost_at_start", "failed", "q", "r")  # not parameters
 
 
 class ControllerOutcome(NamedTuple):
-    """One controller over all cases, its margins on every plant, its gaps in percent on the plants (None if
-    weights mean nothing to it), and the rollout."""
+    """One controller over all cases: its figures and costs, its margins on every plant, its gaps in percent
+    on the plants (None if it has no weights), and the rollout."""
 
     figures: panel.Figures
     costs: np.ndarray
@@ -47,7 +47,7 @@ class ControllerOutcome(NamedTuple):
 
 
 def evaluate(name: str, design: Design, setting: panel.CaseConditions) -> tuple[str, ControllerOutcome]:
-    """One controller on the judging half, with its name."""
+    """Evaluates one controller on the judging half. Returns its name and outcome."""
     cases = setting.rehearsal.judging
     rollout, figures = panel.play(design, panel.rests(design.model, cases, setting.limits), cases, setting)
     margins = [] if design.holds else scorecard.margins(cases.plants, design.law, grid=80)
@@ -57,12 +57,13 @@ def evaluate(name: str, design: Design, setting: panel.CaseConditions) -> tuple[
 
 
 def _gaps(design: Design, setting: panel.CaseConditions) -> np.ndarray | None:
-    """J / J* - 1 in percent on every plant, by CONVENTION; inf if the loop is unstable there."""
+    """Returns J / J* - 1 in percent on every plant, by CONVENTION; inf if the loop is unstable there. Returns
+    None if the controller has no weights, or no design at the weights of the convention."""
     if design.plain is None:
         return None
     try:
         law = design.plain()
-    except ValueError:  # no minimum at the yardstick's weights, though there is one at its own
+    except ValueError:  # no minimum at the weights of the common cost, although there is one at its own
         return None
     cases, (p, m) = setting.rehearsal.judging, (design.model.p, design.model.m)
     first = np.flatnonzero(cases.kind == "constant")[:1]
@@ -87,7 +88,7 @@ def _gaps(design: Design, setting: panel.CaseConditions) -> np.ndarray | None:
 
 
 def _columns(one: ControllerOutcome, setting: panel.CaseConditions) -> dict[str, np.ndarray]:
-    """The figures of FIGURES by column of the table, in its units."""
+    """Returns the figures of FIGURES by column of the table, in its units."""
     f = one.figures
     return {
         "settled_error_degC": f.settled_error,
@@ -112,7 +113,7 @@ def summarise(
     seed: int,
     resamples: int,
 ) -> dict[str, Any]:
-    """The figures of a controller over all cases, with the parameters that its search found."""
+    """Returns the figures of a controller over all cases, with the parameters that its search found."""
     cases, columns = setting.rehearsal.judging, _columns(one, setting)
     figures = {}
     for name, column in FIGURES.items():
@@ -152,8 +153,8 @@ def _gap(one: ControllerOutcome, setting: panel.CaseConditions) -> dict[str, Any
 
 
 def _margin_figures(margins: list[scorecard.Margins]) -> dict[str, Any] | None:
-    """The margins of the plant that a tenth of all plants lie below, of the median one and of the worst;
-    unlimited delay margins as null."""
+    """Returns the 10 % quantile of the margins over the plants, the median and the worst; None for unlimited
+    delay margins."""
     if not margins:
         return None
     result = {}
@@ -191,8 +192,8 @@ def decide(
     tuned: Mapping[str, float],
     seed: int,
 ) -> dict[str, Any]:
-    """The pair, and the plant that decides, with the pair's answer without it. `tuned` are the costs of the
-    searches, by controller."""
+    """Returns the answer for the pair (model-based or data-driven), the plant that decides it, and the pair's
+    winner without this plant. `tuned`: costs of the searches, by controller."""
     block = setting.rehearsal.judging.plant
     costs = {name: results[name].costs for name in entrants}
     a, b = table.answering_pair(entrants, tuned)
@@ -202,7 +203,7 @@ def decide(
     index = scorecard.deciding_plant(costs[one], costs[two], block)
     rest = block != index
     without = {name: values[rest] for name, values in costs.items()}
-    # structures take turns over the plants
+    # plants have one structure in turn
     kind = block % len(panel.STRUCTURES)
     pair = _pair(a, b, costs, block, kind, summary, seed)
     mine = np.flatnonzero(block == index)
@@ -223,7 +224,7 @@ def decide(
 def _pair(
     a: str, b: str, costs: Mapping[str, np.ndarray], block: np.ndarray, kind: np.ndarray, summary, seed: int
 ) -> dict[str, Any]:
-    """The pair's answer; without figures if one of the two is refused."""
+    """Returns the pair's answer; without figures if one of the two is refused."""
     if a not in costs or b not in costs:
         unknown = dict.fromkeys(("winner", "difference", "low", "high", "p", "kept"))
         plants = len(np.unique(block))
@@ -243,7 +244,7 @@ def _pair(
 
 
 def typical_case(results: Mapping[str, ControllerOutcome], entrants: Sequence[str]) -> int:
-    """The case of median cost under the first entrant that does something."""
+    """Returns the case of median cost under the first controller that does something."""
     costs = results[next((name for name in entrants if name != "hold"), entrants[0])].costs
     return int(np.argsort(costs, kind="stable")[len(costs) // 2])
 
@@ -251,7 +252,7 @@ def typical_case(results: Mapping[str, ControllerOutcome], entrants: Sequence[st
 def case_columns(
     results: Mapping[str, ControllerOutcome], setting: panel.CaseConditions, zones: Sequence[str]
 ) -> dict[str, Any]:
-    """The cases as columns: one row a controller and case."""
+    """Returns the cases as columns: one row per controller and case."""
     cases, count = setting.rehearsal.judging, len(results)
     columns = [_columns(one, setting) for one in results.values()]
     crossing = np.concatenate([np.maximum(one.figures.crossing, 0.0) for one in results.values()])
@@ -277,7 +278,7 @@ def trajectory_columns(
     setting: panel.CaseConditions,
     machine: Machine,
 ) -> dict[str, Any]:
-    """The cases {label: number} under every controller, as columns."""
+    """Returns the cases {label: number} under every controller, as columns."""
     time_s = setting.sample_time_s * np.arange(setting.rehearsal.judging.steps)
     parts = [
         (name, label, one.rollout, case) for name, one in results.items() for label, case in shown.items()
@@ -298,26 +299,28 @@ def trajectory_columns(
     return columns
 
 
-REDESIGNS = 7  # plants of the spread that a controller is designed from anew
-BROKEN = 2.0  # times the cost, from which a record that cannot be told from this one gives another controller
+REDESIGNS = 7  # plants of the spread from which a controller is designed again
+BROKEN = 2.0  # times the cost: from there on, an equally plausible record gives a different controller
 
 
 def redesigned(
     name: str, problem: DesignProblem, values: Mapping[str, float], setting: panel.CaseConditions
 ) -> tuple[float, int, int]:
-    """What the bands of the identified plant leave open of a controller's closed loop: with J the mean cost
-    of the controller on the training cases, and J_k that of the same controller designed from plant k of the
-    spread, REDESIGNS of them, the median of max(J_k / J - 1, 0); and how many plants, of how many, give a
-    controller that costs BROKEN times as much, or none.
+    """Returns how much the uncertainty of the identified plant can change a controller's cost, how many
+    plants give a controller that costs BROKEN times as much or none, and out of how many plants. J is the
+    mean cost of the controller on the training cases. J_k is that of the same controller designed from plant
+    k of the spread, for REDESIGNS plants. The first value is the median of max(J_k / J - 1, 0).
 
-    A PI controller takes gain and lag from a plant, a model-based one all of it: each is charged with the
-    doubt in what it takes. The spread is resampled in blocks, so the colour of the residuals is in it."""
+    A PI controller uses gain and lag of a plant, a model-based one uses all of it. So each is charged with
+    the uncertainty of what it uses. The spread is resampled in blocks, so it includes the colour of the
+    residuals.
+    """
     cases = setting.rehearsal.training
 
     def cost(plant: Plant) -> float:
         try:
             made = BY_NAME[name].design(problem._replace(plant=plant), values)
-        except ValueError:  # this plant allows no such controller
+        except ValueError:  # no such controller for this plant
             return float("inf")
         if made is None:
             return float("inf")

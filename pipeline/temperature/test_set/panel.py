@@ -1,14 +1,14 @@
-"""The panel: the plants that nobody learned or tuned on, what they are asked, and what comes out, with every
-controller as it runs (law.py).
+"""The test set (panel) for controllers: plants that were not used for learning or tuning, the cases run on
+them, and the figures computed from the runs. Every controller is simulated as it runs on a machine (law.py).
 
-Plants, drawn uniformly around a nominal one: each input's gain, the speed of the whole plant, more heat lost,
-a sample of delay on every input in a part of them, a lag before every input where the model is too slow to
-hold it, another ambient. Four in five have a structure that no
-controller's model holds beside that (STRUCTURES). Cases of each: constant references from several starts, the
-coldest first, a ramp, a sinusoid, a sequence of references, and a door, a fan and another room while a
-reference is held; sensor noise.
+Plants are drawn uniformly around a nominal one. They vary in each input's gain, the speed of the whole plant,
+extra heat loss, a sample of delay on every input in a part of them, a lag before every input if the model is
+too slow to show it, and the ambient. Four in five also have a structure that no controller's model has
+(STRUCTURES). Cases of each plant: constant references from several starts, the coldest first, a ramp, a
+sinusoid, a sequence of references, and a door, a fan and another room while a reference is held; with sensor
+noise.
 
-The cases are the declared ones on the study's machine; on somebody's records they follow from the record by
+On the study's machine the cases are the declared ones. On a user's recordings they follow from the record by
 stated defaults (scenario_defaults.py).
 """
 
@@ -56,21 +56,21 @@ from pipeline.temperature.test_set.scenario_defaults import (
 )
 from pipeline.temperature.tracking import Law, reached_state
 
-RESTLESS = 1e-8  # reciprocal condition of I - A below which a plant has no rest of its own
-# the surroundings while a reference is held: from, until (shares of the run), share of the rise by which they
-# are colder: a door, a part fan, another room
+RESTLESS = 1e-8  # reciprocal condition number of I - A below which a plant has no steady state of its own
+# the surroundings get colder while a reference is held: from, until (shares of the run), and by which share
+# of the rise: a door, a part fan, another room
 DOOR, FAN, ROOM = (0.1, 0.15, 0.15), (0.3, 0.5, 0.08), (0.6, 1.0, 0.03)
 MOVES = ("ramp", "sinusoid", "disturbed")  # cases without a step of the reference
-GLANCE = 5  # samples: what is outside the band for fewer is noise that the controller answers
+GLANCE = 5  # samples: shorter excursions from the band are the controller's response to noise
 
 
 class Structure(NamedTuple):
-    """What a machine has that no model here holds: a slow wall that passes on a share `wall` of how much
-    warmer the outputs are than at the start, with a time constant of `slower` runs; heat radiated, a share
-    `radiates` of the rise where the outputs are a whole rise from the start; material that carries heat from
-    each output to the next, a share `carried` of how much more the former has warmed, LATE of a run before;
-    sensors in steps of `step_degC`; inputs in steps of a share `duty` of what holds the first reference, of
-    which the first DEAD give nothing."""
+    """What a machine has but no model here. `wall`: a slow wall returns this share of the outputs' mean rise
+    since the start, with a time constant of `slower` runs. `radiates`: share of the rise lost by radiation if
+    the outputs are a whole rise above the start. `carried`: material carries heat from each output to the
+    next, this share of how much more the former has warmed, LATE of a run before. `step_degC`: resolution of
+    the sensors. `duty`: resolution of the inputs as a share of what holds the first reference; the first DEAD
+    steps have no effect."""
 
     wall: float = 0.0
     slower: float = 0.5
@@ -80,7 +80,7 @@ class Structure(NamedTuple):
     duty: float = 0.0
 
 
-# of the plants, in turn
+# the plants have these in turn
 STRUCTURES = (
     Structure(),
     Structure(wall=0.1),
@@ -89,17 +89,18 @@ STRUCTURES = (
     Structure(step_degC=0.25, duty=0.01),
 )
 LATE, DEAD = 0.03, 3
-# the largest lag in series of a plant, as a share of its quickest mode of heat: a cartridge in its bore takes
-# 2 to 13 s, a sensor 1 to 5 s, a hot end that was identified as one mode 130 to 430 s
+# the largest series lag of a plant, as a share of its quickest time constant of heat. For comparison: a
+# cartridge in its bore 2 to 13 s, a sensor 1 to 5 s, a hot end identified as one mode 130 to 430 s
 LAG = 0.05
 
 
 class PlantSpread(NamedTuple):
-    """How far plants lie from the nominal one: input gains 1 +- input_gain each; A' = I + (A - I) / (1 + d),
-    B' = B / (1 + d), d within +- slower, in the modes of heat; A - l I, l from 0 to extra_heat_loss a step;
-    all inputs one step late in a share `delayed`; the ambient +- ambient_degC; all inputs through a lag of 0
-    to `lag` times the plant's quickest time constant of heat, less what the plant holds: every heater in its
-    bore and every sensor has one, and a model that has no mode as quick does not hold it."""
+    """How far plants differ from the nominal one. `input_gain`: gains 1 +- input_gain each. `slower`: A' = I
+    + (A - I) / (1 + d), B' = B / (1 + d), d within +- slower, in the modes of heat. `extra_heat_loss`: A - l
+    I, l from 0 to extra_heat_loss a step. `delayed`: share of plants with all inputs one step late.
+    `ambient_degC`: ambient +- ambient_degC. `lag`: all inputs pass a lag of 0 to `lag` times the plant's
+    quickest time constant of heat, less the lag that the plant already has. Every heater in its bore and
+    every sensor has such a lag, but a model without so quick a mode does not contain it."""
 
     input_gain: float
     slower: float
@@ -110,10 +111,11 @@ class PlantSpread(NamedTuple):
 
 
 def delayed(plant: Plant, late: bool, lag: float = 0.0) -> Plant:
-    """The plant with m more states h, the input before: it acts a sample late, or is carried along unused, so
-    that both kinds have one order. With a first-order lag of `lag` samples in series, no delay itself,
-    h' = k h + (1 - k) u with k = exp(-1 / lag) acts in place of u; one shorter than a sample is none.
-    Feed-through must be a delay already (plant.strictly_proper)."""
+    """Returns the plant with m more states h, the previous input. If `late`, the inputs act through h, one
+    sample later. Otherwise h is carried along unused, so that both kinds have the same order. With a `lag` of
+    at least one sample, h' = k h + (1 - k) u with k = exp(-1 / lag) acts in place of u: a first-order lag in
+    series that adds no delay itself. A shorter lag is ignored. Feed-through must already be a delay
+    (plant.strictly_proper)."""
     n, m, kept = plant.n, plant.m, np.exp(-1 / lag) if lag >= 1 else 0.0
     A, B = np.zeros((n + m, n + m)), np.zeros((n + m, m))
     A[:n, :n], A[n:, n:], B[n:] = plant.A, kept * np.eye(m), (1 - kept) * np.eye(m)
@@ -141,10 +143,10 @@ def varied(
     cells: bool,
     lag: float = 0.0,
 ) -> Plant:
-    """One plant of the spread. An ambient warmer by `ambient` °C warms every cell by as much in the end,
-    where the states are `cells`, and every output otherwise. Of an identified plant only the modes of heat
-    slow down (`paced`). `lag` is a share of its quickest time constant of heat, of which what the
-    plant holds already is taken off."""
+    """Returns one plant of the spread. If the ambient rises by `ambient` °C, the steady state rises as much
+    in every cell (if the states are `cells`) or else in every output. In an identified plant only the modes
+    of heat slow down (`paced`). `lag`: share of the plant's quickest time constant of heat; the lag that the
+    plant already has is subtracted."""
     identity = np.eye(plant.n)
     pace = identity / (1 + slower) if cells else paced(plant.A, slower)
     A = identity + pace @ (plant.A - identity)
@@ -156,14 +158,14 @@ def varied(
 
 
 def quickest(A: np.ndarray) -> float:
-    """The time constant in samples of the quickest mode of heat of A (n, n); 0 if none decays."""
+    """Returns the time constant in samples of the quickest mode of heat of A (n, n); 0 if none decays."""
     sizes = [abs(value) for value in np.linalg.eigvals(A) if _of_heat(value)]
     return float(-1 / np.log(min(sizes))) if sizes and min(sizes) < 1 else 0.0
 
 
 def lag_held(plant: Plant, samples: int) -> float:
-    """How many samples of lag and dead time a plant holds: what its response to a pulse misses of its peak
-    before that, sum (1 - h_k / h_peak) with h_k = sum |C A^k B|, k < samples."""
+    """Returns how many samples of lag and dead time a plant has: how much its pulse response falls short of
+    its peak before the peak, sum (1 - h_k / h_peak) with h_k = sum |C A^k B|, k < samples."""
     acting, response = plant.B, np.empty(samples)
     for k in range(samples):
         response[k] = np.abs(plant.C @ acting).sum()
@@ -173,12 +175,13 @@ def lag_held(plant: Plant, samples: int) -> float:
 
 
 def paced(A: np.ndarray, slower: float) -> np.ndarray:
-    """The pace P (n, n) by which A' = I + P (A - I), B' = P B, b' = P b have the steady state of A, B, b and
-    heat up 1 + slower times as slowly.
+    """Returns the pace P (n, n) with which A' = I + P (A - I), B' = P B, b' = P b have the steady state of A,
+    B, b and heat up 1 + slower times as slowly.
 
-    A mode of heat is one whose eigenvalue l has Re l > 0.3 and |Im l| <= |1 - Re l|: overdamped, or hardly
-    less. P is 1 / (1 + slower) on their invariant subspace and 1 on that of the others: delays, sensors'
-    noise and what rings stand for no heat, and I + (A - I) / (1 + slower) would make them unstable.
+    A mode of heat has an eigenvalue l with Re l > 0.3 and |Im l| <= |1 - Re l|: overdamped, or hardly less. P
+    is 1 / (1 + slower) on the invariant subspace of these modes and 1 on that of the others. The others
+    (delays, sensor noise, oscillations) are not heat, and I + (A - I) / (1 + slower) would make them
+    unstable.
     """
     n = len(A)
     T, Z, slow = scipy.linalg.schur(A, output="complex", sort=_of_heat)
@@ -206,8 +209,9 @@ def drawn(
     rng: np.random.Generator,
     holdable: Callable[[Plant], bool] = lambda _: True,
 ) -> list[Plant]:
-    """`count` plants around the nominal ones in turn. One that is not `holdable` lies half as far from its
-    nominal one, and half as far again: what nobody can hold compares no controllers."""
+    """Returns `count` plants around the nominal ones in turn. A plant that is not `holdable` is moved half as
+    far from its nominal one, and half as far again, because a plant that no controller can hold cannot
+    compare controllers."""
     plants, lags = [], rng.spawn(1)[0].uniform(0, spread.lag, count)
     for k in range(count):
         plant = nominal[k % len(nominal)]
@@ -230,12 +234,12 @@ def drawn(
     return plants
 
 
-NEARER = (1.0, 0.5, 0.25, 0.125, 0.0)  # shares of the spread that are tried
+NEARER = (1.0, 0.5, 0.25, 0.125, 0.0)  # tried shares of the spread
 
 
 def corners(nominal: Sequence[Plant], spread: PlantSpread) -> tuple[list[Plant], Strength]:
-    """The family that the governor guards: each plant in time and a sample late, and within what range its
-    inputs act."""
+    """Returns the family that the governor guards, each plant in time and one sample late, and the range of
+    strength of its inputs."""
     family = [delayed(plant, late) for plant in nominal for late in (False, True)]
     weakest = (1 - spread.input_gain) / (1 + spread.slower)
     strongest = (1 + spread.input_gain) / (1 - spread.slower)
@@ -246,10 +250,10 @@ def corners(nominal: Sequence[Plant], spread: PlantSpread) -> tuple[list[Plant],
 
 
 class Questions(NamedTuple):
-    """What every plant is asked, by zone: starts (a, p) and constant references (j, p) in °C, each start with
-    each; from the middle start a ramp (r (p,), slope (p,) in °C a step), a sinusoid (mean (p,), amplitude
-    (p,), period in steps) and a sequence (g, p) of references for equal times; held at the first reference, a
-    door, a fan and another room."""
+    """The cases for every plant, by zone. starts (a, p) and constant references (j, p) in °C: each start with
+    each reference. From the middle start: ramp (r (p,), slope (p,) in °C a step), sinusoid (mean (p,),
+    amplitude (p,), period in steps), and sequence (g, p) of references for equal times. Held at the first
+    reference: a door, a fan and another room."""
 
     starts: np.ndarray
     constants: np.ndarray
@@ -259,16 +263,16 @@ class Questions(NamedTuple):
 
 
 class Cases(NamedTuple):
-    """`each` cases of every plant, plant by plant: s in all. Held at y0 by u0 from state x0, `hold` samples,
-    then `steps` under the controller.
+    """The cases of all plants, plant by plant: `each` cases per plant, s in all. A case is held at y0 by u0
+    from state x0 for `hold` samples, then runs `steps` samples under the controller.
 
-    `references` and of each case `begin` (s, g), the step at which its g-th reference begins, and `asked`
-    (s, g), which one; noise (s,) in °C drawn from `seed` (s,); `start` (s,) which start, 0 the coldest.
-    `warms` (plants, n) is what surroundings that are 1 °C warmer add to a state each step, `outside`
-    (steps, s) by how many °C they are, `rise` in °C from the coldest start to the first reference;
-    `structure` (plants, 6) of each plant; `carries` (plants, p, n) what warms one output by 1 °C. `told`
-    (steps, s, q) are the measured disturbances less their mean, `pushed` (steps, s, p) what they do to
-    the outputs in °C.
+    `begin` (s, g): step at which the g-th reference of a case begins; `asked` (s, g): its index in
+    `references`. `noise`: (p,) in °C, generated from `seed`; `start` (s,): index of the start, 0 the coldest.
+    `warms` (plants, n): what surroundings 1 °C warmer add to the state per step; `outside` (steps, s): by how
+    many °C they are warmer; `rise`: °C from the coldest start to the first reference. `structure` (plants,
+    6): the Structure of each plant; `carries` (plants, p, n): what warms one output by 1 °C. `told` (steps,
+    s, q): the measured disturbances less their mean; `pushed` (steps, s, p): their effect on the outputs in
+    °C.
     """
 
     plants: list[Plant]
@@ -296,7 +300,7 @@ class Cases(NamedTuple):
 
     @property
     def cold(self) -> np.ndarray:
-        """Whether a case (s,) is a start from cold."""
+        """Whether a case (s,) starts from cold."""
         return (self.kind == "constant") & (self.start == 0)
 
 
@@ -313,10 +317,10 @@ def asked(
     structures: Sequence[Structure] = STRUCTURES,
     told: Told | None = None,
 ) -> Cases:
-    """The questions put to every plant, which has one of `structures` in turn. Where states are `cells`, a
-    start holds every cell at one temperature, otherwise every output, or what comes nearest within `limits`,
-    the coldest start aside: a machine that is switched on need not be held; noise (p,) in °C. `told` are the
-    disturbances that are measured."""
+    """Returns the cases of every plant; plants have one of `structures` in turn. If states are `cells`, a
+    start holds every cell at one temperature; otherwise it holds every output there, or as near as `limits`
+    allow. The coldest start may leave the limits, because a machine that is just switched on need not be
+    held. `noise` (p,) in °C; `told`: the measured disturbances."""
     starts = np.vstack([questions.starts, questions.constants[:1]])
     references = [constant(r) for r in questions.constants]
     rows = [("constant", a, [j]) for a in range(len(questions.starts)) for j in range(len(references))]
@@ -377,9 +381,9 @@ def asked(
 
 
 def pushed(told: Told | None, steps: int, p: int) -> tuple[np.ndarray, np.ndarray]:
-    """While the part fan of `surroundings` is on, measured disturbances go to their highest level one after
-    the other, and stay there, less their mean (steps, q); and what that does to the outputs in °C
-    (steps, p)."""
+    """Returns the measured disturbances less their mean (steps, q), and their effect on the outputs in °C
+    (steps, p). While the part fan of `surroundings` is on, disturbances go to their highest level one after
+    the other, and stay there until it is off."""
     if told is None:
         return np.zeros((steps, 0)), np.zeros((steps, p))
     q = len(told.high)
@@ -390,31 +394,31 @@ def pushed(told: Told | None, steps: int, p: int) -> tuple[np.ndarray, np.ndarra
 
 
 def surroundings(steps: int, rise: float) -> np.ndarray:
-    """By how many °C (steps,) the surroundings are warmer, of a machine that is `rise` °C warmer than
-    they."""
+    """Returns by how many °C (steps,) the surroundings are warmer, for a machine `rise` °C warmer than they
+    are."""
     t = np.arange(steps) / steps
     on = [share * ((t >= first) & (t < last)) for first, last, share in (DOOR, FAN, ROOM)]
     return -rise * np.sum(on, axis=0)
 
 
 def warmed(plant: Plant, *, cells: bool) -> np.ndarray:
-    """What surroundings that are 1 °C warmer add to the state (n,) each step of a plant of `delayed`, so that
-    every cell, or every output, ends 1 °C warmer."""
+    """Returns what surroundings 1 °C warmer add to the state (n,) per step, in a plant of `delayed`, so that
+    every cell, or every output, becomes 1 °C warmer in the steady state."""
     inner = _undelayed(plant)
     warmer = np.ones(inner.n) if cells else reached_state(inner) @ np.ones(inner.p)
     return np.r_[warmer - inner.A @ warmer, np.zeros(plant.n - inner.n)]
 
 
 def carrying(plant: Plant) -> np.ndarray:
-    """What adds to the state (p, n) each step of a plant of `delayed`, output by output, so that it alone
-    ends 1 °C warmer."""
+    """Returns, for each output, what must be added to the state (p, n) per step in a plant of `delayed`, so
+    that this output alone becomes 1 °C warmer in the steady state."""
     inner = _undelayed(plant)
     warmer = reached_state(inner)
     return np.pad((warmer - inner.A @ warmer).T, ((0, 0), (0, plant.n - inner.n)))
 
 
 def _undelayed(plant: Plant) -> Plant:
-    """The plant of `delayed` without the inputs that it carries along."""
+    """Returns the plant of `delayed` without the stored inputs."""
     n = plant.n - plant.m
     return plant._replace(
         A=plant.A[:n, :n], B=plant.A[:n, n:] + plant.B[:n], C=plant.C[:, :n], b=plant.b[:n], K=plant.K[:n]
@@ -424,8 +428,8 @@ def _undelayed(plant: Plant) -> Plant:
 def _held(
     plant: Plant, y: np.ndarray, cells: bool, limits: ActuatorLimits | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """State and input of a plant of `delayed` held at outputs y (p,), or at cells of y[0] °C; where inputs
-    would have to leave `limits`, at rest under the nearest within."""
+    """Returns state and input of a plant of `delayed`, held at outputs y (p,), or at cells of y[0] °C. If
+    inputs would have to leave `limits`, it rests under the nearest inputs within them."""
     inner = _undelayed(plant)
     if cells:
         x = np.full(inner.n, y[0])
@@ -435,7 +439,7 @@ def _held(
     if limits is None:
         return np.r_[x, u], u
     within, balance = np.clip(u, limits.low, limits.high), np.eye(inner.n) - inner.A
-    # a plant that nearly integrates drifts slowly from where it is, and has no rest worth a start
+    # a plant that nearly integrates drifts slowly, and its steady state would be no useful start
     if np.any(within != u) and np.linalg.cond(balance) < 1 / RESTLESS:
         x = np.linalg.solve(balance, inner.B @ within + inner.b)
     return np.r_[x, within], within
@@ -445,8 +449,8 @@ def _held(
 
 
 class Rollout(NamedTuple):
-    """(steps, s, .): true outputs y, the reference r and the target y_star, inputs wished and applied; and
-    what the controller measured."""
+    """The signals of a simulation, each (steps, s, .): true outputs y, the reference r and the target y_star,
+    inputs wished and applied, and the measured outputs."""
 
     y: np.ndarray
     r: np.ndarray
@@ -457,12 +461,12 @@ class Rollout(NamedTuple):
 
 
 def rests(model: Plant, cases: Cases, limits: ActuatorLimits) -> list[Rest]:
-    """Where a plant rests under each reference of the cases, then at each start."""
+    """Returns where a plant rests under each reference of the cases, then at each start."""
     return [rest(model, reference, limits) for reference in _wanted(cases)]
 
 
 def aims(law: Law, at: Sequence[Rest], cases: Cases) -> list[Aim]:
-    """What a law adds to rest there, one by one."""
+    """Returns the Aim of a law for each Rest of `rests`."""
     return [aim(law, one, reference) for one, reference in zip(at, _wanted(cases), strict=True)]
 
 
@@ -471,13 +475,13 @@ def _wanted(cases: Cases) -> list[Reference]:
 
 
 def noise_of(cases: Cases) -> np.ndarray:
-    """(hold + steps, s, p): the same for every controller."""
+    """Returns the sensor noise (hold + steps, s, p), the same for every controller."""
     shape = (cases.hold + cases.steps, len(cases.plant), len(cases.noise))
     return cases.noise * np.random.default_rng(cases.seed).standard_normal(shape)
 
 
 def schedule(cases: Cases, aimed: Sequence[Aim]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """r, y* (steps, s, p) and feed (steps, s, m) of every case."""
+    """Returns r, y* (steps, s, p) and feed (steps, s, m) of every case."""
     steps, s = cases.steps, len(cases.plant)
     p, m = aimed[0].Y.shape[0], aimed[0].feed.shape[0]
     r, target, feed = np.empty((steps, s, p)), np.empty((steps, s, p)), np.empty((steps, s, m))
@@ -494,7 +498,7 @@ def schedule(cases: Cases, aimed: Sequence[Aim]) -> tuple[np.ndarray, np.ndarray
 
 
 def rolled_out(controller: Deployed, cases: Cases, aimed: Sequence[Aim]) -> Rollout:
-    """Every case at once under one controller; `aimed` from `aims`."""
+    """Simulates every case at once under one controller; `aimed` from `aims`."""
     r, target, feed = schedule(cases, aimed)
     usual = 0.0 if controller.forward is None else controller.forward.mean
     held, forward = held_readings(cases), all_fed_forward(controller, cases.told + usual)
@@ -514,8 +518,8 @@ def rolled_out(controller: Deployed, cases: Cases, aimed: Sequence[Aim]) -> Roll
 
 
 def held_readings(cases: Cases) -> np.ndarray:
-    """(hold + 1, s, p): what is measured while the machines are held, the last of it as the controller takes
-    over."""
+    """Returns the measurements (hold + 1, s, p) while the machines are held. The last one is taken when the
+    controller takes over."""
     C, d = (np.stack([getattr(plant, name) for plant in cases.plants])[cases.plant] for name in ("C", "d"))
     held = np.einsum("spn,sn->sp", C, cases.x0) + d
     return in_steps(held + noise_of(cases)[: cases.hold + 1], cases.structure[cases.plant, 4][:, None])
@@ -527,8 +531,8 @@ def simulated(
     r: np.ndarray,
     target: np.ndarray,
 ) -> Rollout:
-    """Every machine at once from where it is held; drive(t, measured (s, p)) gives the inputs (s, m) applied
-    and wished. The structure of a machine acts on what is measured, on what its inputs do, and on the
+    """Simulates every machine at once from where it is held. drive(t, measured (s, p)) returns the inputs (s,
+    m) applied and wished. The structure of a machine changes what is measured, what its inputs do, and the
     surroundings."""
     count, each, (steps, s, p), m = len(cases.plants), cases.each, r.shape, cases.u0.shape[1]
     A, B, C = (
@@ -565,7 +569,7 @@ def simulated(
 
 
 def some(cases: Cases, kinds: Sequence[str], plants: int) -> Cases:
-    """Of the first `plants` plants the cases of these kinds, the disturbed one among them."""
+    """Returns the cases of these kinds, the disturbed one among them, on the first `plants` plants."""
     keep = np.isin(cases.kind, kinds) & (cases.plant < plants)
     rows = ("plant", "kind", "start", "x0", "u0", "begin", "asked")
     return cases._replace(
@@ -579,15 +583,15 @@ def some(cases: Cases, kinds: Sequence[str], plants: int) -> Cases:
 
 
 def in_steps(values: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """The nearest of whole steps; as they are where the step is 0."""
+    """Rounds values to whole steps; unchanged if the step is 0."""
     return np.where(step > 0, step * np.round(values / np.where(step > 0, step, 1.0)), values)
 
 
 class Figures(NamedTuple):
-    """An engineer's figures of each case (s,), of true outputs, worst zone: °C, steps, percent. Settling, or
-    heating from the coldest start, is inf where the outputs are outside at the end; both, and overshoot, are
-    NaN where the reference makes no step; the time at limits is NaN from the coldest start, the dip where no
-    door, fan or room disturbs."""
+    """An engineer's figures of each case (s,), from true outputs, worst zone, in °C, steps or percent.
+    Settling, or heating from the coldest start, is inf if the outputs are outside the band at the end. Both,
+    and overshoot, are NaN if the reference makes no step. The time at limits is NaN from the coldest start;
+    the dip is NaN if no door, fan or room disturbs."""
 
     settled_error: np.ndarray
     settled_zone: np.ndarray
@@ -614,12 +618,16 @@ def figures(
     band: float,
     settled: int = 100,
 ) -> Figures:
-    """Settled error: |mean of the last `settled` steps - r|. Peak: largest |y - r| of the later half of them.
-    Settling and heating: the last step outside `band` °C of the target, for GLANCE steps at least, counted
-    from each new reference, the longest of them. Overshoot: past the target in the direction of the step. At
-    limits: share of (input, step) wished outside. Energy: mean input. Travel: mean |u(t+1) - u(t)|, of the
-    input that moves most. Dip: largest |y - r| of all steps. Crossing: how far y lies beyond low, high (p,).
-    Outside: steps outside the band, an edge of a fifth of it counted in part: smooth."""
+    """Computes the figures of a simulation.
+
+    Settled error: |mean of the last `settled` steps - r|. Peak: largest |y - r| of the later half of them.
+    Settling and heating: the last step outside `band` °C of the target, for at least GLANCE steps, counted
+    from each new reference; the longest of them. Overshoot: past the target in the direction of the step. At
+    limits: share of (input, step) whose wished input is outside the limits. Energy: mean input. Travel: mean
+    |u(t+1) - u(t)| of the input that moves most. Dip: largest |y - r| of all steps. Crossing: how far y lies
+    beyond low, high (p,). Outside: steps outside the band; near its edge, a fifth of it wide, steps count in
+    part, so that the figure is smooth.
+    """
     error = rollout.y - rollout.r
     late = np.abs(error[-settled:].mean(axis=0))
     off = rollout.y - rollout.target
@@ -659,7 +667,8 @@ def figures(
 
 
 def lasting(outside: np.ndarray) -> np.ndarray:
-    """Of (steps, s) the runs of GLANCE steps and more, and the one that is there from the beginning."""
+    """Returns the parts of `outside` (steps, s) that last GLANCE steps or more, or exist from the first
+    step."""
     padded = np.pad(outside, ((GLANCE - 1, 0), (0, 0)), constant_values=True)
     ends = np.array(np.lib.stride_tricks.sliding_window_view(padded, GLANCE, axis=0).all(axis=-1))
     lasts = ends.copy()
@@ -669,9 +678,9 @@ def lasting(outside: np.ndarray) -> np.ndarray:
 
 
 def costs(results: Figures, allowance: Mapping[str, float]) -> np.ndarray:
-    """The declared cost of each case (s,): the sum of figure / allowance of what applies to it; 1e4 at
-    most. `allowance` has by the names of Figures what the cost counts as one; `rms` counts where the
-    reference makes no step, `outside` and `overshoot` where it does."""
+    """Returns the declared cost of each case (s,): the sum of figure / allowance over the figures that apply,
+    at most 1e4. `allowance`: by the names of Figures, the value that counts as a cost of one. `rms` counts if
+    the reference makes no step, `outside` and `overshoot` if it does."""
     one = {name: getattr(results, name) / unit for name, unit in allowance.items()}
     moving = np.isnan(results.overshoot)
     response = np.where(moving, one["rms"], one["outside"] + np.nan_to_num(one["overshoot"]))
@@ -680,9 +689,9 @@ def costs(results: Figures, allowance: Mapping[str, float]) -> np.ndarray:
 
 
 class Rehearsal(NamedTuple):
-    """The two halves of the panel, and what counts on this machine: the band and the settling limit that
-    follow from its record (None: as declared), the shortest time from cold to the first reference, noise (p,)
-    in °C, references out of reach, and in words where it comes from."""
+    """The two halves of the test set, and what follows from this machine's record: the band and the settling
+    limit (None: as declared), the shortest time from cold to the first reference, noise (p,) in °C, and
+    references out of reach. `source` says in words where the cases come from."""
 
     judging: Cases
     training: Cases
@@ -695,11 +704,14 @@ class Rehearsal(NamedTuple):
 
 
 class CaseConditions(NamedTuple):
-    """What all controllers share, tuned and judged: the rehearsal, limits of inputs and outputs (low, high
-    (p,) in °C), the governor, the integrator's limit in °C, the settled window in steps, what the cost counts
-    as one, the discount, the sample time, the share of the declared delay margins that is asked here, below 1
-    (`faster`) of a machine that must settle sooner than the panel's, as a hair dryer, whose whole answer is
-    over within 1 s, and what makes up for measured disturbances."""
+    """The conditions that all controllers share when they are tuned and judged: the simulation (`rehearsal`),
+    limits of inputs and outputs (low, high (p,) in °C), the governor, the integrator's limit in °C, the
+    settled window in steps, the allowances of the cost, the discount, the sample time, and the feed-forward
+    of measured disturbances.
+
+    `faster`: share of the declared delay margins that is required here. It is below 1 for a machine that must
+    settle sooner than the panel's. For example, the whole response of a hair dryer is over within 1 s.
+    """
 
     rehearsal: Rehearsal
     limits: ActuatorLimits
@@ -723,10 +735,11 @@ def conditions(
     family: Sequence[Plant],
     told: Told | None = None,
 ) -> CaseConditions:
-    """`family`: the identified plant first, then its spread; `told`: the disturbances that are measured."""
+    """Returns the conditions. `family`: the identified plant first, then its spread; `told`: the measured
+    disturbances."""
     band = rehearsal.band_degC / settings.band_degC
     late = (rehearsal.settling_s or settings.settling_s) / settings.settling_s
-    # a slow machine is allowed its time, a small one its degrees
+    # the allowance scales with the settling limit and with the band
     allowance = {
         "outside": tuning.allow_settling_s * late / machine.sample_time_s,
         "overshoot": tuning.allow_overshoot_degC * band,
@@ -736,7 +749,7 @@ def conditions(
         "travel": tuning.allow_travel_percent,
         "rms": tuning.allow_overshoot_degC * band,
     }
-    # nearer to a reference than its noise no forecast can tell an overshoot
+    # an overshoot within the noise cannot be forecast
     overshoot = max(tracking.governor_overshoot_degC * band, 3 * float(rehearsal.noise.max()))
     return CaseConditions(
         rehearsal,
@@ -756,8 +769,8 @@ def conditions(
 def design_problem(
     models: Mapping[str, Any], tracking: Tracking, setting: CaseConditions, truth: Plant | None
 ) -> DesignProblem:
-    """What controllers are designed from: the same for tuning and for judging, whatever the length of their
-    cases. `models` has plant, family, window, kernel and printer_pid."""
+    """Returns the problem from which controllers are designed. It is the same for tuning and for judging,
+    whatever the length of their cases. `models` has plant, family, window, kernel and printer_pid."""
     return DesignProblem(
         **models,
         truth=truth,
@@ -770,7 +783,7 @@ def design_problem(
 
 
 def deploy(design: Design, setting: CaseConditions) -> Deployed:
-    """A controller with what all of them run under."""
+    """Returns a controller with the conditions that all controllers share."""
     return deployed(
         design.law,
         setting.limits,
@@ -784,7 +797,7 @@ def deploy(design: Design, setting: CaseConditions) -> Deployed:
 def play(
     design: Design, rests: Sequence[Rest], half: Cases, setting: CaseConditions
 ) -> tuple[Rollout, Figures]:
-    """A controller over one half of the panel, as deployed; `rests` from rests of its model."""
+    """Simulates a controller, as deployed, on one half of the panel; `rests` from `rests` of its model."""
     rollout = rolled_out(deploy(design, setting), half, aims(design.law, rests, half))
     low, high = setting.output_limits
     return rollout, figures(
@@ -805,7 +818,7 @@ def input_limits(machine: Machine) -> ActuatorLimits:
 
 
 def output_limits(machine: Machine) -> tuple[np.ndarray, np.ndarray]:
-    """low, high (p,) in °C; -inf and inf where none is declared."""
+    """Returns low, high (p,) in °C; -inf and inf if none is declared."""
     low = [-np.inf if o.low is None else o.low for o in machine.outputs]
     high = [np.inf if o.high is None else o.high for o in machine.outputs]
     return np.array(low), np.array(high)
@@ -814,8 +827,9 @@ def output_limits(machine: Machine) -> tuple[np.ndarray, np.ndarray]:
 def watchdog(
     machine: Machine, settings: Panel, family: Sequence[Plant], noise: np.ndarray, overshoot: float
 ) -> Governor:
-    """The governor of all controllers: the identified plant, in time and a sample late, with inputs that act
-    as the panel's spread has them; what it keeps from a limit is three deviations of the sensors' noise."""
+    """Returns the governor of all controllers. It guards the identified plant, in time and one sample late,
+    with input strengths in the range of the panel's spread. Its margin to a limit is three standard
+    deviations of the sensors' noise."""
     low, high = output_limits(machine)
     guarded, strength = corners(family[:1], spread_of(settings))
     limits = OutputLimits(low, high, 3 * noise, overshoot)
@@ -833,8 +847,8 @@ def spread_of(settings: Panel) -> PlantSpread:
 
 
 def spread_around(settings: Panel, identified: Plant) -> PlantSpread:
-    """The declared spread, with no more heat lost than is little beside what somebody's machine loses, and
-    with a lag, which the study's machine is known not to have."""
+    """Returns the declared spread with a lag, and with an extra heat loss of at most a fifth of the slowest
+    mode's. The study's machine is known to have no such lag."""
     spread, slowest = spread_of(settings), 1 - np.abs(np.linalg.eigvals(identified.A)).max()
     return spread._replace(
         extra_heat_loss=float(np.clip(0.2 * slowest, 0.0, spread.extra_heat_loss)), lag=LAG
@@ -842,8 +856,8 @@ def spread_around(settings: Panel, identified: Plant) -> PlantSpread:
 
 
 def from_declaration(settings: Panel, machine: Machine, truth: Plant, family: Sequence[Plant]) -> Rehearsal:
-    """The study's machine: judged around the truth, tuned around the identified family, so that no controller
-    may lean on what one identification got wrong."""
+    """Returns the test set of the study's machine. Controllers are judged around the true plant and tuned
+    around the identified family, so that none can profit from errors of one identification."""
     reference = np.array([o.reference for o in machine.outputs])
     noise, limits = np.full(len(reference), settings.noise_degC), input_limits(machine)
     judging, training = (
@@ -904,8 +918,9 @@ def _half(
     told: Told | None = None,
     held: ActuatorLimits | None = None,
 ) -> Cases:
-    """One half of the panel: cases of `steps` at most, on plants that lie around those of `around` as
-    `declared` says; starts are held within `limits`, and every constant reference can be within `held`."""
+    """Returns one half of the panel: cases of at most `steps`, on plants around those of `around` that
+    differ as in `declared`. Starts are held within `limits`, and every constant reference can be held within
+    `held`."""
     rng = np.random.default_rng(half.seed)
     scaled = PlantSpread(*(half.spread * value for value in declared))._replace(
         delayed=min(half.spread * declared.delayed, 1.0)
@@ -929,10 +944,10 @@ def _half(
     )
 
 
-# of the recorded span, by which the ambient is varied at most where recordings do not differ by more: what
-# spans 12 °C was not recorded in a room that may be 8 °C warmer
+# largest variation of the ambient as a share of the recorded span, if recordings do not differ by more: a
+# record that spans 12 °C is not from a room that may be 8 °C warmer
 AMBIENT_SHARE = 0.25
-HOLDABLE = (1.0, 0.75, 0.5, 0.25, 0.1)  # shares of it that are tried
+HOLDABLE = (1.0, 0.75, 0.5, 0.25, 0.1)  # tried shares of that variation
 
 
 def _ambient(
@@ -942,9 +957,10 @@ def _ambient(
     limits: ActuatorLimits,
     references: np.ndarray,
 ) -> float:
-    """By how many °C the ambient of a plant may differ: as the panel says, at most AMBIENT_SHARE of the
-    recorded span, and no further than the references (j, p) can still be held, which no controller could
-    mend; but by as much as recordings of the same machine were found to differ."""
+    """Returns by how many °C the ambient of a plant may differ: the panel's value, but at most AMBIENT_SHARE
+    of the recorded span, and no more than leaves the references (j, p) within reach of the inputs: beyond
+    that no controller could hold them. It is at least the difference found between recordings of the same
+    machine."""
 
     def missed(warmer: float) -> float:
         moved = identified._replace(d=identified.d + warmer)
@@ -968,13 +984,13 @@ def from_record(
     recordings: Sequence[int],
     told: Told | None = None,
 ) -> Rehearsal:
-    """Somebody's machine: both halves are drawn around plants of the identified family, and starts,
-    references, band, settling limit and length follow from the record: segments u (T, m and more:
-    disturbances follow the inputs) in percent and y (T, p) in °C, as segments.without_gaps returns them.
+    """Returns the test set of a user's machine. Both halves lie around plants of the identified family.
+    Starts, references, band, settling limit and length follow from the record: segments u (T, m and more:
+    disturbances follow the inputs) in percent and y (T, p) in °C, as from segments.without_gaps.
 
-    What a plant may differ by: the spread is a bootstrap of the record, every second member for each half,
-    and around each the panel's input gains, pace and delay. The ambient differs by `_ambient`. More heat is
-    lost by a fifth of what the slowest mode loses at most.
+    The spread of plants is a bootstrap of the record, every second member for each half, and around each the
+    panel's input gains, pace and delay. The ambient differs by `_ambient`. The extra heat loss is at most a
+    fifth of the slowest mode's.
     """
     identified = family[0]
     u = [a[:, : len(machine.inputs)] for a in u]
@@ -1029,7 +1045,7 @@ def from_record(
 
 
 def _infeasible(machine: Machine, missed: list[Infeasible]) -> list[dict[str, Any]]:
-    """References out of reach, and what binds."""
+    """Returns the references out of reach, and which limit prevents each."""
     return [
         {
             "output": machine.outputs[one.output].name,
@@ -1042,7 +1058,7 @@ def _infeasible(machine: Machine, missed: list[Infeasible]) -> list[dict[str, An
 
 
 def _binding(machine: Machine, one: Infeasible) -> str:
-    """What keeps a reference out of reach, in words."""
+    """Returns in words what keeps a reference out of reach."""
     if one.input is None:
         return {"inputs": "fewer inputs than references"}.get(one.limit, f"the declared {one.limit} limit")
     signal = machine.inputs[one.input]

@@ -1,5 +1,5 @@
-"""Cost against the length of the record: what controllers cost that were learned from its beginning alone,
-with the weights that the whole record was tuned for, and the length at which two of them change places."""
+"""Cost against the length of the record: the cost of controllers learned from the beginning of the record
+only, with the weights tuned on the whole record, and the length at which two of them change places."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,7 +15,8 @@ RESAMPLES = 500
 
 
 def beginning(signal: Sequence[np.ndarray], share: float) -> list[np.ndarray]:
-    """The first `share` of all samples of the segments (T, k), in the order in which they were recorded."""
+    """Returns the first `share` of all samples of the segments (T, k), in the order in which they were
+    recorded."""
     left = round(share * sum(map(len, signal)))
     pieces = []
     for piece in signal:
@@ -25,7 +26,7 @@ def beginning(signal: Sequence[np.ndarray], share: float) -> list[np.ndarray]:
 
 
 def few_plants(setting: panel.CaseConditions) -> panel.CaseConditions:
-    """The conditions with the first PLANTS plants of the judging half."""
+    """Returns the conditions with the first PLANTS plants of the judging half."""
     judging = setting.rehearsal.judging
     count = min(PLANTS, len(judging.plants))
     cases = panel.some(judging, tuple(np.unique(judging.kind)), count)
@@ -33,7 +34,7 @@ def few_plants(setting: panel.CaseConditions) -> panel.CaseConditions:
 
 
 def plant_costs(design: Design, setting: panel.CaseConditions) -> np.ndarray:
-    """The logarithm of the mean cost on each plant of the judging half (plants,), as deployed."""
+    """Returns the logarithm of the mean cost on each plant of the judging half (plants,), as deployed."""
     cases = setting.rehearsal.judging
     played = panel.play(design, panel.rests(design.model, cases, setting.limits), cases, setting)[1]
     costs = panel.costs(played, setting.allowance).reshape(len(cases.plants), -1)
@@ -43,9 +44,9 @@ def plant_costs(design: Design, setting: panel.CaseConditions) -> np.ndarray:
 def curves(
     costs: Sequence[Mapping[str, np.ndarray]], samples: Sequence[int], pair: tuple[str, str], *, seed: int
 ) -> dict[str, Any]:
-    """By controller its cost at each length, the geometric mean over plants with the ends of its 90 % band,
-    None where it could not be learned; and where the pair changes places. `costs` has by length and
-    controller the logarithms (plants,) of `plant_costs`."""
+    """Returns the cost of each controller at each length: the geometric mean over plants with the ends of its
+    90 % band, None if it could not be learned. Also returns the length at which the pair changes places.
+    `costs`: for each length and controller, the logarithms (plants,) of `plant_costs`."""
     names = list(dict.fromkeys(name for one in costs for name in one))
     plants = max((len(values) for one in costs for values in one.values()), default=0)
     drawn = np.random.default_rng(seed).integers(0, plants, (RESAMPLES, plants))
@@ -74,9 +75,9 @@ def curves(
 
 
 def _crossing(ratio: np.ndarray, samples: np.ndarray, drawn: np.ndarray) -> dict[str, Any]:
-    """Where the mean over plants of the log-ratio (lengths, plants) of two costs last changes its sign, with
-    the ends of the 90 % interval over `drawn` plants; None beyond the lengths that were tried. `share` of the
-    resamples cross within."""
+    """Returns the length at which the mean over plants of the log-ratio (lengths, plants) of two costs last
+    changes its sign, with the ends of the 90 % interval over resampled plants (`drawn`). None means outside
+    the tried lengths. `share`: share of the resamples that cross within them."""
     here = _last_change(ratio.mean(axis=1), samples)
     found = np.array([_last_change(ratio[:, row].mean(axis=1), samples) or np.nan for row in drawn])
     within = found[np.isfinite(found)]
@@ -87,7 +88,8 @@ def _crossing(ratio: np.ndarray, samples: np.ndarray, drawn: np.ndarray) -> dict
 
 
 def _last_change(ratio: np.ndarray, samples: np.ndarray) -> float | None:
-    """The length at which a curve (lengths,) last goes through zero, straight over the logarithm of it."""
+    """Returns the length at which a curve (lengths,) last goes through zero, interpolated linearly over the
+    logarithm of the length; None if it never does."""
     changes = np.flatnonzero(np.sign(ratio[1:]) * np.sign(ratio[:-1]) < 0)
     if not len(changes):
         return None

@@ -1,8 +1,8 @@
-"""What a rehearsal on somebody's record asks of the controllers, by stated defaults: from how fast the
-machine is, where it was recorded, and what its inputs can hold.
+"""Chooses by stated defaults the cases of a simulation on a user's record: from how fast the machine is,
+where it was recorded, and what its inputs can hold.
 
-A bed that needs 230 s for one time constant cannot be judged by the 60 s of another machine, nor started at
-15 °C in a room of 22. Each default has its reason beside its name; none is a setting.
+A bed with a time constant of 230 s cannot be judged by the 60 s of another machine, nor started at 15 °C in a
+room of 22 °C. Each default has its reason beside its name; none is a setting.
 """
 
 from collections.abc import Sequence
@@ -16,40 +16,38 @@ from pipeline.temperature.identification.first_order import time_constant
 from pipeline.temperature.identification.refinement import one_step_errors, simulated
 from pipeline.temperature.plant import Plant, hold_output, strictly_proper
 
-RANGE = (0.01, 0.99)  # quantiles that count as recorded: a spike, or one sample of a start, is none
-ONE_DEVIATION = (0.1587, 0.8413)  # quantiles of a normal one standard deviation either side of its median
-MIDDLE = 0.5  # of the recorded span, where a reference is changed
-LOWER_SHARE = 0.15  # of the recorded span, by which the second reference lies below the first
-# as an open loop needs to come within 5 % of its end; the delay counts as the step and its answer are late
+RANGE = (0.01, 0.99)  # quantiles of the recorded range, so that a spike or one sample does not set it
+ONE_DEVIATION = (0.1587, 0.8413)  # normal quantiles one standard deviation below and above the median
+MIDDLE = 0.5  # of the recorded span: the middle start
+LOWER_SHARE = 0.15  # of the recorded span: how far the second reference lies below the first
+# time of an open loop to come within 5 % of its end; the delay counts twice, for the step and its response
 SETTLING = (3.0, 2.0)  # time constants, delays
-BAND_NOISE = 3.0  # standard deviations: a sensor's noise alone leaves it once in 370 samples
-BAND_SHARE = 0.01  # of the recorded span, where a sensor is better than the machine needs
-WIDEST_BAND_DEGC = (
-    1.0  # no print tells less; where noise asks for more the true outputs are judged all the same
-)
-TIME_CONSTANTS = 8.0  # in a case: 3 to settle, 3 to settle again, and the last sixth of what is then left
+BAND_NOISE = 3.0  # standard deviations: noise alone leaves the band once in 370 samples
+BAND_SHARE = 0.01  # of the recorded span, if a sensor is better than the machine needs
+# a smaller difference does not show in a print. More noise does not widen the band: true outputs are judged
+WIDEST_BAND_DEGC = 1.0
+TIME_CONSTANTS = 8.0  # in a case: 3 to settle, 3 to settle again, and the last sixth, the settled window
 STEPS = (600, 3000)
-PERIOD = (
-    4.0  # time constants of a sinusoid: two periods fit, and its heat flow is twice that of holding still
-)
-REACHED_DEGC = 0.1  # a reference that is missed by less is reached: no sensor here shows it
-# of an input's limit, in a reference that is not the owner's: with 15 % less gain it can still be held
+# time constants in a period of the sinusoid: two periods fit; its heat flow is twice that of holding still
+PERIOD = 4.0
+REACHED_DEGC = 0.1  # a reference missed by less counts as reached: no sensor here shows the difference
+# of an input's limit, kept free at a reference that the owner did not choose: it can still be held with 15 %
+# less gain
 HEADROOM = 0.15
-FLOOR_SHARE = (
-    0.05  # of an input's range above its lowest: in a room that is a little warmer it can still be held
-)
-BEYOND = 1e3  # times as dear as missing a reference: crossing a declared limit of an output
-LEAK = 1e-9  # a step, by which a plant that only integrates is taken to leak, so that it has a steady state
+# of an input's range, kept free above its lowest: a reference can still be held in a slightly warmer room
+FLOOR_SHARE = 0.05
+BEYOND = 1e3  # crossing a declared limit of an output costs this many times as much as missing a reference
+LEAK = 1e-9  # assumed leak per step of a plant that only integrates, so that it has a steady state
 
 
 class MachineScale(NamedTuple):
-    """How fast, how warm and how noisy a machine is, by its outputs (p,).
+    """Speed, temperature range and noise of a machine, per output (p,).
 
     time_constant_s: the first-order lag that explains the record; delay_s: effective dead time of the
-    strongest input, lags of sensors in it. low_degC..high_degC: recorded range. noise_degC: standard
-    deviation of what one step cannot foretell, neither by the model nor by the reading before.
-    ambient_degC_spread: the largest difference of the mean error of simulation between recordings, 0 with
-    one: another room, another day.
+    strongest input, including lags of sensors. low_degC..high_degC: recorded range. noise_degC: standard
+    deviation of what neither the model nor the previous reading predicts one step ahead. ambient_degC_spread:
+    the largest difference between recordings in the mean simulation error (another room, another day); 0 with
+    one recording.
     """
 
     time_constant_s: np.ndarray
@@ -61,12 +59,12 @@ class MachineScale(NamedTuple):
 
 
 class Infeasible(NamedTuple):
-    """A reference of output `output` that cannot be held, or not beside the others: `reachable_degC` is the
-    nearest within limits.
+    """A reference of output `output` that cannot be held, alone or together with the others. `reachable_degC`
+    is the nearest one within limits.
 
-    `input` is the one at its `limit` "low" or "high" that would move it most; None where the limit is not of
-    an input: "output low" or "output high" of the machine's own limits, or "inputs", fewer than the
-    references need.
+    `input` is the one at its `limit` "low" or "high" that would move the output most. It is None if the limit
+    is not that of an input: "output low" or "output high" for the machine's own limits, or "inputs" if there
+    are fewer than the references need.
     """
 
     output: int
@@ -77,10 +75,10 @@ class Infeasible(NamedTuple):
 
 
 class CaseDefaults(NamedTuple):
-    """What the cases of a rehearsal are: starts (k, p) at which the plant is held, references (j, p), both
-    steady states within the limits of inputs and outputs by the model; settling_s the rule's limit, band_degC
-    the band of settling; ramp_degC_per_step (p,) from the lower reference, one ramp a run; `sequence` (3, p).
-    """
+    """The cases of a simulation. Starts (k, p), at which the plant is held, and references (j, p), in °C;
+    both are steady states within the limits of inputs and outputs by the model. settling_s: limit of the
+    settling time; band_degC: band of settling; ramp_degC_per_step (p,): from the lower reference, one ramp
+    per run; `sequence` (3, p) in °C."""
 
     starts: np.ndarray
     references: np.ndarray
@@ -103,17 +101,18 @@ def machine_scale(
     sample_time_s: float,
     recording_of_segment: Sequence[int],
 ) -> MachineScale:
-    """Scale of a machine from segments u (T, m), y (T, p), the model of them, and the recording of each.
+    """Returns the scale of a machine from segments u (T, m), y (T, p), their model, and the recording of each
+    segment.
 
-    Time constants come from the record: a model's slowest pole may be a drift. None is longer than the
-    longest segment, which could not show it. Raises ValueError where no input moves.
+    Time constants come from the record, because a model's slowest pole may be a drift. None is longer than
+    the longest segment, which could not show it. Raises ValueError if no input moves.
     """
     p = model.p
     longest = max(map(len, y)) * sample_time_s
     taus = [time_constant(u, [b[:, o] for b in y], sample_time_s=sample_time_s) for o in range(p)]
     low, high = np.nanquantile(np.vstack(y), RANGE, axis=0)
     below, above = np.nanquantile(np.vstack(one_step_errors(model, u, y)), ONE_DEVIATION, axis=0)
-    # larger errors than those of the reading before are faults of the model, no noise of a sensor
+    # errors larger than the change since the last reading come from the model, not from the sensor
     repeated = np.sqrt(np.nanmean(np.vstack([np.diff(b, axis=0) for b in y]) ** 2, axis=0))
     return MachineScale(
         np.minimum(taus, longest),
@@ -126,7 +125,8 @@ def machine_scale(
 
 
 def _delays(model: Plant, moved: np.ndarray, horizon: int) -> np.ndarray:
-    """Dead time (p,) in samples of the input whose recorded range `moved` (m,) acts most on each output."""
+    """Returns the dead time (p,) in samples of the input that acts most on each output over its recorded
+    range `moved` (m,)."""
     strongest = [
         row[int(np.argmax([abs(rise.slope) * d for rise, d in zip(row, moved, strict=True)]))]
         for row in rises(model, horizon)
@@ -135,8 +135,9 @@ def _delays(model: Plant, moved: np.ndarray, horizon: int) -> np.ndarray:
 
 
 def _ambient_spread(u, y, model: Plant, recording_of_segment: Sequence[int]) -> np.ndarray:
-    """Largest less smallest mean error of simulation (p,) of the recordings, the start of each segment fitted
-    together with its mean: alone, the start would hide a part of another room."""
+    """Returns the range (p,) of the mean simulation error over the recordings. The start of each segment is
+    fitted together with its mean, because a start fitted alone would hide part of the effect of another
+    room."""
     errors: dict[int, list[np.ndarray]] = {}
     for a, b, recording in zip(u, y, recording_of_segment, strict=True):
         errors.setdefault(int(recording), []).append(b - simulated(model, a, b, means_removed=True))
@@ -156,15 +157,15 @@ def defaults(
     output_high: np.ndarray,
     sample_time_s: float,
 ) -> CaseDefaults:
-    """Starts, references and rules for one machine; `limits` low and high (m,) of the inputs in percent,
-    output_low and output_high (p,) in °C, infinite where the owner declares none.
+    """Returns starts, references and rules for one machine. `limits`: low and high (m,) of the inputs in
+    percent; output_low and output_high (p,) in °C, infinite if the owner declares none.
 
-    starts: the coldest of the record, as a machine is switched on, and the middle of its range, or the
-    nearest to it that the inputs can hold. references: the declared one where it can be held; in its place
-    otherwise the nearest that leaves HEADROOM to inputs and the band to declared limits of outputs; and one
+    starts: the coldest state of the record, as when a machine is switched on, and the middle of its range, or
+    the nearest that the inputs can hold. references: the declared one if it can be held; otherwise the
+    nearest that leaves HEADROOM to inputs and the band to declared limits of outputs; and a second one,
     LOWER_SHARE of the recorded span below. ramp: from the lower to the higher in one run. sinusoid: about
-    their middle, so small that its heat is no more than the way between them needs. sequence: lower, higher,
-    middle. All references lie between two states that can be held, so that they can be held too.
+    their middle, so small that it needs no more heat than the change between them does. sequence: lower,
+    higher, middle. All references lie between two states that can be held, so they can be held too.
     """
     span = scale.high_degC - scale.low_degC
     widest = np.maximum(BAND_NOISE * scale.noise_degC, BAND_SHARE * span).max()
@@ -177,7 +178,7 @@ def defaults(
     if (missed := np.abs(reached - asked) > REACHED_DEGC).any():
         held_back = np.where(missed, _nearest(model, asked, careful)[0], asked)
         first, u_first = _nearest(model, held_back, bounds)
-        # a zone within reach may need the heat of one that is held back
+        # a zone within reach may need the heat of a zone whose reference is lowered
         entries = [
             _missed(model, int(o), asked, reached, first, (u if missed[o] else u_first), bounds)
             for o in np.flatnonzero(missed | (np.abs(first - asked) > REACHED_DEGC))
@@ -203,8 +204,9 @@ def defaults(
 
 
 def heat_up_s(model: Plant, cold: np.ndarray, reference: np.ndarray, high: np.ndarray) -> float:
-    """Time in s in which the inputs at `high` (m,) take the outputs from where they are held at `cold` (p,)
-    past `reference` (p,) in °C, each zone once; STEPS[1] samples where one never gets there."""
+    """Returns the time in s in which the inputs at `high` (m,) heat the outputs from `cold` (p,), where they
+    are held, past `reference` (p,) in °C, each zone at least once. Returns STEPS[1] samples if one never gets
+    there."""
     model = strictly_proper(model)
     x, _ = hold_output(model, cold)
     past = model.C @ x + model.d >= reference - REACHED_DEGC
@@ -223,7 +225,7 @@ def unreachable(
     output_low: np.ndarray,
     output_high: np.ndarray,
 ) -> list[Infeasible]:
-    """References that a machine cannot hold where they are judged as they were asked; arguments as
+    """Returns the references that a machine cannot hold, if they are judged as requested; arguments as in
     `defaults`."""
     bounds = Bounds(*limits, output_low, output_high)
     asked = np.asarray(asked_reference, float)
@@ -233,7 +235,7 @@ def unreachable(
 
 
 class Bounds(NamedTuple):
-    """Limits of inputs (m,) in percent and of outputs (p,) in °C, infinite where none is declared."""
+    """Limits of inputs (m,) in percent and of outputs (p,) in °C, infinite if none is declared."""
 
     low: np.ndarray
     high: np.ndarray
@@ -242,8 +244,8 @@ class Bounds(NamedTuple):
 
 
 def _drawn_in(bounds: Bounds, band: float) -> Bounds:
-    """Limits with HEADROOM of the inputs towards zero, FLOOR_SHARE above a lowest of zero or more, and
-    outputs the band within theirs, or in the middle where that is less than the band away."""
+    """Returns narrower limits: inputs by HEADROOM towards zero, and FLOOR_SHARE above a lowest value of zero
+    or more; outputs by the band, or to their middle if the limits are less than two bands apart."""
     raised = bounds.low + FLOOR_SHARE * (bounds.high - bounds.low)
     low = np.where(bounds.low < 0, (1 - HEADROOM) * bounds.low, raised)
     high = np.where(bounds.high > 0, np.maximum((1 - HEADROOM) * bounds.high, low), bounds.high)
@@ -252,8 +254,8 @@ def _drawn_in(bounds: Bounds, band: float) -> Bounds:
 
 
 def steady_map(model: Plant) -> tuple[np.ndarray, np.ndarray]:
-    """G (p, m) and g (p,) of the steady outputs y = G u + g; a plant that only integrates leaks LEAK a
-    step."""
+    """Returns G (p, m) and g (p,) of the steady outputs y = G u + g. A plant that only integrates is assumed
+    to leak LEAK per step."""
     model = strictly_proper(model)
     balance = np.eye(model.n) - model.A
     if np.linalg.cond(balance) > 1e13:
@@ -265,15 +267,17 @@ def steady_map(model: Plant) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nearest(model: Plant, r: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
-    """Steady outputs (p,) nearest r by the sum of misses, and inputs (m,) for them, within limits: a linear
-    programme over [u; miss; beyond], limits of outputs crossed only where no input keeps them.
+    """Returns the steady outputs (p,) nearest to r by the sum of misses, and inputs (m,) for them, within
+    limits. Solves a linear programme over [u; miss; beyond]. Limits of outputs are crossed only if no input
+    keeps them. Raises ValueError if there is no solution.
 
-    The sum of misses, not of their squares: a zone that cannot be reached pulls no other off its reference.
+    The sum of misses is used, not of their squares, so that a zone that cannot be reached does not pull
+    others off their references.
     """
     G, g = steady_map(model)
     p, m, one = model.p, model.m, np.eye(model.p)
     none, size = np.zeros((p, p)), 1 / np.maximum(np.abs(G).max(axis=0), np.finfo(float).tiny)
-    G = G * size  # inputs in units of the °C that they make
+    G = G * size  # inputs in units of their effect in °C
     rows = np.vstack([np.hstack([G, -one, none]), np.hstack([-G, -one, none])])
     right = np.r_[r - g, g - r]
     for sign, limit in ((1.0, bounds.output_high), (-1.0, bounds.output_low)):
@@ -301,8 +305,9 @@ def _missed(
     u: np.ndarray,
     bounds: Bounds,
 ) -> Infeasible:
-    """What keeps output o from its reference: a declared limit of its own, or the input of u at its limit, in
-    the direction that would help, whose range moves it most."""
+    """Returns what keeps output o from its reference: a declared limit of its own, or an input in u that is
+    at its limit in the direction that would help. Of several inputs, it is the one whose range moves the
+    output most."""
     figures = o, float(asked[o]), float(reached[o])
     if asked[o] > bounds.output_high[o]:
         return Infeasible(*figures, None, "output high")

@@ -1,9 +1,10 @@
-"""One panel, one yardstick, every law: unclipped and without integrator, where the discrete Riccati equation
-gives the optimum (regret J / J* - 1); costs only under the same weights, judged by true outputs. Then the
-margins of a law on a plant; which controller is best, what tells model-based and data-driven apart, and which
-plant decides; and what a record is enough for. What a controller does as deployed is panel.py's.
+"""Compares control laws on the same scenarios with the same reference. The laws run unclipped and without
+integrator, so that the discrete Riccati equation gives the optimum (regret J / J* - 1). All costs use the
+same weights and the true outputs. Also computes the margins of a law on a plant; which controller is best;
+what separates model-based from data-driven, and which plant decides; and what a record is sufficient for.
+Controllers as deployed are simulated in panel.py.
 
-Cases of one plant stand or fall together: plants are the blocks of every test and of every band.
+The cases of one plant depend on each other, so plants are the blocks of every test and of every band.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,11 +24,11 @@ Run = tuple[np.ndarray, np.ndarray]  # true outputs and inputs (steps, scenarios
 
 
 class Scenarios(NamedTuple):
-    """Scenarios, one a row: plant[i] of `plants` (all of one order), held at x0 by u0, reference r, sensor
+    """Scenarios, one per row: plant[i] of `plants` (all of one order), held at x0 by u0, reference r, sensor
     noise (hold + steps, s, p) in °C.
 
-    The controller watches the hold for `hold` steps before it takes over: its memory then holds what a
-    machine would have put there. It runs for `steps`.
+    The controller watches the machine for `hold` samples before it takes over, so that its memory holds what
+    a machine would have put there. It then runs for `steps` samples.
     """
 
     plants: list[Plant]
@@ -41,7 +42,7 @@ class Scenarios(NamedTuple):
 
 
 class CommonCost(NamedTuple):
-    """The weights diag(q), diag(r) and the discount under which every J of one comparison is computed."""
+    """The weights diag(q), diag(r) and the discount gamma of every J in one comparison."""
 
     q: np.ndarray
     r: np.ndarray
@@ -49,8 +50,8 @@ class CommonCost(NamedTuple):
 
 
 def simulate(panel: Scenarios, law: Law) -> Run:
-    """Every scenario at once under one law with its own feed-forward; nothing limits the inputs, and xi stays
-    zero."""
+    """Runs every scenario at once under one law with its own feed-forward. Inputs are not limited, and xi
+    stays zero. Returns true outputs and inputs (steps, s, p or m)."""
     A, B, C, b, d = (
         np.stack([getattr(panel.plants[i], name) for i in panel.plant]) for name in ("A", "B", "C", "b", "d")
     )
@@ -59,7 +60,7 @@ def simulate(panel: Scenarios, law: Law) -> Run:
     x, noise = panel.x0.copy(), np.broadcast_to(panel.noise, (panel.hold + steps, scenarios, p))
     held = np.einsum("sij,sj->si", C, x) + d
     z = panel.u0 @ law.start_u.T + (held + noise[0]) @ law.start_y.T + law.start
-    # the memory of a window is a shift: as a sparse matrix it costs a copy, not a product
+    # the memory of a window is a shift; as a sparse matrix it costs only a copy, not a product
     memory = scipy.sparse.csr_array(law.A.T) if np.count_nonzero(law.A) < 0.05 * law.A.size else law.A.T
     for t in range(panel.hold):
         z = z @ memory + panel.u0 @ law.B_u.T + (held + noise[t]) @ law.B_y.T + panel.r @ law.B_r.T + law.c
@@ -77,14 +78,15 @@ def simulate(panel: Scenarios, law: Law) -> Run:
 
 
 def cost(panel: Scenarios, run: Run, yardstick: CommonCost) -> np.ndarray:
-    """(3) of every scenario (s,): discounted, on true outputs and applied inputs."""
+    """Returns (3) for every scenario (s,): discounted, on true outputs and applied inputs."""
     y, u = run
     stage = (y - panel.r) ** 2 @ yardstick.q + u**2 @ yardstick.r
     return yardstick.gamma ** np.arange(len(stage)) @ stage
 
 
 def optimum(panel: Scenarios, yardstick: CommonCost) -> np.ndarray:
-    """J* of every scenario (s,): the Riccati law of its own plant, which knows the state, unclipped."""
+    """Returns J* of every scenario (s,): the cost of the Riccati law of its own plant, with known state,
+    unclipped."""
     best = [
         gains(plant, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma) for plant in panel.plants
     ]
@@ -106,24 +108,25 @@ def optimum(panel: Scenarios, yardstick: CommonCost) -> np.ndarray:
 
 
 class Margins(NamedTuple):
-    """`disk`: the smaller of the disk margins at the plant's inputs and at its outputs,
-    every channel changing by itself at the same time (a lower bound, by scaling);
-    `delay_s`: extra delay in all sensors at once; `stable`: every eigenvalue of the closed
-    loop inside the unit circle."""
+    """The margins of a law on one plant. `disk`: the smaller of the disk margins at the plant's inputs and at
+    its outputs, with all channels changing independently at the same time (a lower bound, by scaling).
+    `delay_s`: extra delay in all sensors at once, in seconds. `stable`: every eigenvalue of the closed loop
+    lies inside the unit circle."""
 
     disk: float
     delay_s: float
     stable: bool
 
 
-DOUBLINGS = 14  # of the power of a loop that shows that it decays
-AT_ONCE = 16  # plants, the loops of which are in memory together
+DOUBLINGS = 14  # of the power of A by which `is_stable` shows that a loop decays
+AT_ONCE = 16  # plants whose loops are in memory together
 
 
 def margins(plants: Sequence[Plant], law: Law, *, grid: int = 240) -> list[Margins]:
-    """Of each plant: disk margin 1 / max |S - I/2| (Seiler, Packard, Gahinet 2020, skew 0) and delay margin
-    min (pi + arg lambda(L)) / omega over |lambda(L)| = 1."""
-    # rad a step: even in logarithms where loops of heaters cross, then even to pi
+    """Returns the margins of the law on each plant; both are 0 if the loop is unstable. Disk margin: 1 / max
+    |S - I/2| (Seiler, Packard, Gahinet 2020, skew 0). Delay margin: min (pi + arg lambda(L)) / omega over
+    |lambda(L)| = 1. `grid`: number of frequencies."""
+    # rad a step: logarithmic in the range where loops of heaters cross, then linear up to pi
     slow = np.geomspace(1e-4, 0.3, grid // 2, endpoint=False)
     omega = np.concatenate([slow, np.linspace(0.3, np.pi, grid - grid // 2)])
     z = np.exp(1j * omega)
@@ -136,8 +139,8 @@ def margins(plants: Sequence[Plant], law: Law, *, grid: int = 240) -> list[Margi
 
 
 def _structured(M: np.ndarray, *, sweeps: int = 12) -> np.ndarray:
-    """Upper bound of the structured singular value of M (grid, k, k) for independent channels: |D M D^-1|
-    with D by Osborne's balancing, never above |M|."""
+    """Returns an upper bound of the structured singular value of M (grid, k, k) for independent channels: |D
+    M D^-1| with D by Osborne's balancing, never above |M|."""
     k = M.shape[1]
     off, d, squares = np.abs(M) ** 2 * (1 - np.eye(k)), np.ones(M.shape[:2]), np.ones(M.shape[:2])
     for _ in range(sweeps):
@@ -178,8 +181,9 @@ def _margins(
 
 
 def is_stable(A: np.ndarray) -> bool:
-    """Whether every eigenvalue of A (n, n) lies inside the unit circle. A power of A with a norm below 1
-    shows it, for a quarter of what the eigenvalues of a long memory cost; if none is found, they tell."""
+    """Returns whether every eigenvalue of A (n, n) lies inside the unit circle. A power of A with norm below
+    1 proves it, at a quarter of the cost of the eigenvalues of a long memory. If no such power is found, the
+    eigenvalues decide."""
     power = A
     for _ in range(DOUBLINGS):
         norm = np.abs(power).sum(axis=1).max(initial=0.0)
@@ -190,16 +194,16 @@ def is_stable(A: np.ndarray) -> bool:
 
 
 def _response(plant: Plant, z: np.ndarray) -> np.ndarray:
-    """Frequency response (grid, p, m) of a plant whose feed-through is a delay."""
+    """Returns the frequency response (grid, p, m) of a plant whose feed-through is a delay."""
     B = np.broadcast_to(plant.B, (len(z), plant.n, plant.m))
     return plant.C @ np.linalg.solve(z[:, None, None] * np.eye(plant.n) - plant.A, B)
 
 
 def closed_loop(plant: Plant, law: Law) -> np.ndarray:
-    """The state matrix of plant, memory and integrator together, [x; z; xi], unclipped.
+    """Returns the state matrix of plant, memory and integrator together, [x; z; xi], unclipped.
 
-    With fewer inputs than outputs K_r xi (m,) stands for xi: what else xi holds moves no input, and would
-    count as a mode that never decays.
+    With fewer inputs than outputs, K_r xi (m,) replaces xi. The rest of xi moves no input and would count as
+    a mode that never decays.
     """
     integrates = np.any(law.integral)
     C, D, Kz, Kr = plant.C, law.D, law.K, law.K_r if integrates else np.zeros_like(law.K_r)
@@ -216,9 +220,9 @@ def closed_loop(plant: Plant, law: Law) -> np.ndarray:
 
 
 def law_response(law: Law, z: np.ndarray) -> np.ndarray:
-    """Frequency response K (grid, m, p) of the law, u = -K(z) y, its memory fed with its own command: of a
-    memory that is a plain shift (controller.compact) as polynomials in 1 / z, of any other by one Schur form,
-    triangular at every frequency."""
+    """Returns the frequency response K (grid, m, p) of the law, u = -K(z) y, with its memory fed its own
+    command. If the memory is a plain shift (law.compact), K is computed from polynomials in 1 / z; otherwise
+    from one Schur form, which is triangular at every frequency."""
     m, q = law.K.shape
     if q and q % m == 0 and np.array_equal(law.A, np.eye(q, k=m)) and np.array_equal(law.K, np.eye(m, q)):
         back = z[:, None] ** -np.arange(1, q // m + 1)
@@ -240,14 +244,14 @@ def law_response(law: Law, z: np.ndarray) -> np.ndarray:
 
 
 def _delay_margin(omega: np.ndarray, loci: np.ndarray) -> float:
-    """Smallest delay in samples that takes an eigenvalue of the loop to -1: both sides of
-    each unit crossing are tried, the smaller counts."""
+    """Returns the smallest delay in samples that takes an eigenvalue of the loop to -1. Both sides of each
+    unit crossing are tried, and the smaller value counts."""
     size = np.abs(loci)
     crossing = (size[:-1] - 1) * (size[1:] - 1) < 0
     lag = np.minimum(
         (np.angle(loci[:-1]) + np.pi) / omega[:-1, None], (np.angle(loci[1:]) + np.pi) / omega[1:, None]
     )
-    # a delay of whole samples turns the locus at pi by pi a sample: where it is larger than one there, it
+    # a delay of whole samples turns the locus at pi by pi a sample. If the locus is larger than one there, it
     # meets -1 without crossing the circle
     last = (np.angle(loci[-1]) + np.pi) / omega[-1]
     lags = np.concatenate([lag[crossing], last[size[-1] > 1]])
@@ -260,10 +264,11 @@ LEVEL = 0.05
 def chosen(
     costs: Mapping[str, np.ndarray], plant: np.ndarray, passes: Mapping[str, bool], *, seed: int
 ) -> tuple[str | None, str | None, Paired | None]:
-    """The first of those that pass, in the order of `costs` (simplest first), that no more complex one beats:
-    one replaces it where its costs (s,) are lower beyond chance, paired by plant, one-sided at LEVEL. Then
-    the cheapest of the others that pass, and the test of the first one against it; None where nobody passes,
-    or no other."""
+    """Returns the best controller that passes, the cheapest other one that passes, and the test of the best
+    against that one. `costs` (s,) by controller are ordered from simple to complex. The choice starts with
+    the first that passes. A more complex one replaces it if its costs are lower beyond chance: paired by
+    plant, one-sided at LEVEL. Each is None if no controller passes; the last two are None if only one
+    passes."""
     able = [name for name in costs if passes[name]]
     if not able:
         return None, None, None
@@ -279,7 +284,7 @@ def chosen(
 
 
 def between(champion: np.ndarray, challenger: np.ndarray, plant: np.ndarray, *, seed: int) -> Paired:
-    """The challenger's improvement over the champion on the same cases, paired by plant."""
+    """Returns the improvement of the second controller over the first on the same cases, paired by plant."""
     return paired(
         np.maximum(champion, 1e-9),
         np.maximum(challenger, 1e-9),
@@ -291,13 +296,14 @@ def between(champion: np.ndarray, challenger: np.ndarray, plant: np.ndarray, *, 
 def pair(
     a: str, b: str, costs: Mapping[str, np.ndarray], plant: np.ndarray, structure: np.ndarray, *, seed: int
 ) -> dict[str, Any]:
-    """Of two contestants a and b the `winner`, the cheaper one beyond chance and beyond what the structure of
-    a machine changes, None where nobody is; by how many percent of the other's cost the cheaper one is so
-    (`difference`), with the ends `low` and `high` of the 90 % interval, the two-sided `p`, and
-    `by_structure` the same difference on the plants of each structure (s,).
+    """Compares two controllers a and b by their costs (s,). `difference`: by how many percent of the other's
+    cost the cheaper one is lower; `low`, `high`: the ends of its 90 % interval; `p`: two-sided.
+    `by_structure`: the same difference on the plants of each machine structure, from `structure` (s,).
+    `winner`: the cheaper controller if the difference is beyond chance and `kept`, otherwise None.
 
-    `kept`: the difference is larger than the standard deviation of those. By t, one more structure keeps the
-    sign in 79 % and more: of five, P(t_4 < 1 / sqrt(1 + 1 / 5)).
+    `kept`: the difference is larger than the standard deviation over the structures. By Student's t, one more
+    structure then keeps the sign with at least 79 % probability: for five structures, P(t_4 < 1 / sqrt(1 + 1
+    / 5)).
     """
     forward = between(costs[b], costs[a], plant, seed=seed)
     backward = between(costs[a], costs[b], plant, seed=seed)
@@ -324,8 +330,8 @@ def pair(
 
 
 def deciding_plant(a: np.ndarray, b: np.ndarray, plant: np.ndarray) -> int:
-    """The plant on which the costs (s,) of two contestants differ most in the direction in which they differ
-    on the whole: without it the verdict is told too."""
+    """Returns the plant that contributes most to the overall difference between the costs (s,) of two
+    controllers. The verdict without this plant is reported too."""
     ratio = np.log(np.maximum(a, 1e-9) / np.maximum(b, 1e-9))
     by_plant = np.array([ratio[plant == index].mean() for index in np.unique(plant)])
     return int(np.unique(plant)[(np.sign(by_plant.sum() or 1.0) * by_plant).argmax()])
@@ -334,10 +340,10 @@ def deciding_plant(a: np.ndarray, b: np.ndarray, plant: np.ndarray) -> int:
 def banded(
     values: np.ndarray, plant: np.ndarray, *, seed: int, resamples: int = 200
 ) -> tuple[dict[str, float], int]:
-    """Of a figure (s,), less of which is better, `median` and 90 % quantile `q90` over all cases, the ends
-    `low` and `high` of the 90 % band of that quantile with plants resampled as blocks, and the `worst`, inf
-    where a run never settles; and the case that has it. Values are NaN where the figure does not apply; all
-    of the band is NaN if it applies nowhere."""
+    """Returns a summary of a figure (s,) for which lower is better, and the case with the worst value. The
+    summary has the `median` and 90 % quantile `q90` over all cases, the ends `low` and `high` of the 90 %
+    band of that quantile, with plants resampled as blocks, and the `worst`, inf if a run never settles.
+    Values are NaN if the figure does not apply; if it applies nowhere, the whole summary is NaN."""
     applies = np.flatnonzero(~np.isnan(values))
     if not len(applies):
         return dict.fromkeys(("median", "q90", "low", "high", "worst"), np.nan), 0
@@ -355,9 +361,9 @@ def banded(
 
 
 def mean_and_worst(costs: np.ndarray, plant: np.ndarray, *, weight: float) -> float:
-    """One number for a search: the geometric mean of the plants' costs, as the paired test counts them, and
-    with `weight` that of the costliest quarter, which moves smoothly where the single worst plant would jump.
-    One plant that no controller holds cannot set the gains of all."""
+    """Returns one number for a search: the geometric mean of the plants' costs, as in the paired test,
+    combined with that of the costliest quarter at `weight`. The quarter changes smoothly, while the single
+    worst plant would jump. One plant that no controller can hold then cannot set the gains for all."""
     by_plant = np.sort([np.log(max(costs[plant == index].mean(), 1e-9)) for index in np.unique(plant)])
     tail = by_plant[-max(1, len(by_plant) // 4) :].mean()
     return float(np.exp((by_plant.mean() + weight * tail) / (1 + weight)))
@@ -375,10 +381,11 @@ def sufficiency(
     least: int,
     allowed: float,
 ) -> tuple[float, int]:
-    """Whether the record is long enough for its noise, by the record alone: the extra cost of a controller
-    that `learn` makes of half of it, the mean of both halves, on `scenarios` of the model learned from all of
-    its `samples`, where the one of the whole record costs `whole`; and at how many samples it would be the
-    excess `allowed`, as it falls as one over the samples, `least` of them at least."""
+    """Tests from the record alone whether it is long enough for its noise. `learn` makes a controller from
+    each half of the record. Returns their mean extra cost, relative to the cost `whole` of the controller
+    from all `samples`, on `scenarios` of the model learned from all of them. Also returns the number of
+    samples, at least `least`, at which this excess would fall to `allowed`, if it falls as one over the
+    samples."""
     gaps = []
     for part in (0, 1):
         half_u, half_y = (
@@ -392,8 +399,8 @@ def sufficiency(
 
 
 class KernelCandidate(NamedTuple):
-    """One state that Algorithm 2 was tried on: the regression, the gap of its gain on the window's model, and
-    the reason of a refusal. The gap of a refused candidate is infinite."""
+    """One state on which Algorithm 2 was tried: the regression, the gap in cost of its gain on the window's
+    model, and the reason if it was refused. The gap of a refused candidate is infinite."""
 
     state: str
     learned: kernel.Regression | None
@@ -411,11 +418,11 @@ def kernel_candidates(
     largest: int,
     offset: bool,
 ) -> list[KernelCandidate]:
-    """Algorithm 2 on windows of 1 to `largest` samples and on the predicted state, all from one record. The
-    model of the long window judges each, on `scenarios` of it.
+    """Tries Algorithm 2 on windows of 1 to `largest` samples and on the predicted state, all from one record.
+    Each is judged on `scenarios` of the long window's model.
 
-    Without noise the shortest window that holds the plant's state is exact. With noise longer windows are
-    biased; the predicted state is not.
+    Without noise, the shortest window that holds the plant's state is exact. With noise, longer windows are
+    biased, but the predicted state is not.
     """
     best = optimum(scenarios, yardstick)
     tried = [

@@ -1,26 +1,26 @@
-"""Bayesian optimisation of the weights Q = diag(q), R = diag(r) (seed 1,
-section 5), generic in the cost that is minimised.
+"""Bayesian optimisation of the weights Q = diag(q), R = diag(r) (seed 1, section 5), for any cost.
 
-What the paper's tuning finds, in plain words. The fitness (37) weighs errors and inputs with 1: it *is* the
-index (3) at Q = R = I, over l steps. The controller designed with Q = R = I is therefore its optimum (but for
-the cut at l): 151,820 for the BAAM extruder from 20 °C, which no search can undercut. The "58.5 % better" of
-the paper compares indices with different weights, like prices in two currencies: Q = R = 0.4 I gives the very
-same gain, hence the same temperatures and inputs, and "improves" the index by 60.0 %. On one yardstick, (37)
-itself, the paper's tuned weights are 4.96 % (model-based) and 39.8 % (data-driven) worse than those it
-started from. The search is worth having for other costs (settling, overshoot, limits, the worst plant of a
-spread); (37) tests it, because there the answer is known.
+What the paper's tuning finds: the fitness (37) weights errors and inputs with 1, so it *is* the index (3) at
+Q = R = I, over l steps. The controller designed with Q = R = I is therefore its optimum (except for the cut
+at l): 151,820 for the BAAM extruder from 20 °C, and no search can find less. The "58.5 % better" of the paper
+compares indices with different weights, like prices in two currencies. Q = R = 0.4 I gives exactly the same
+gain, so the same temperatures and inputs, and yet "improves" the index by 60.0 %. By the same measure, (37)
+itself, the paper's tuned weights are 4.96 % (model-based) and 39.8 % (data-driven) worse than its initial
+weights. The search is useful for other costs (settling, overshoot, limits, the worst plant of a spread). (37)
+tests it, because its optimum is known.
 
-The search works on log-weights, since weights act by their ratios and span decades: a Gaussian process with a
-Matern 5/2 kernel and one length per weight, and expected improvement inside a trust region that grows on
-success and shrinks on failure (Eriksson et al. 2019, TuRBO). A prior holds the lengths to a plausible size:
-50 points in 12 dimensions do not determine 12 lengths, and without it the likelihood calls half of the
-weights irrelevant and the search ends 100 to 3,000 above the optimum of (37), not 1 to 34.
+The search works on log-weights, because weights act by their ratios and span decades. It uses a Gaussian
+process with a Matern 5/2 kernel and one length per weight, and expected improvement inside a trust region
+that grows on success and shrinks on failure (Eriksson et al. 2019, TuRBO). A prior keeps the lengths at a
+plausible size, because 50 points in 12 dimensions do not determine 12 lengths. Without it the likelihood
+makes half of the weights irrelevant, and the search ends 100 to 3,000 above the optimum of (37), not 1 to 34.
 
 A candidate may fail (an unstable loop, a cost that is not finite). It enters the history as NaN with its
-reason, and never the model of the cost: a second Gaussian process learns from the marks "worked" and "failed"
-how likely a candidate is to work, and the acquisition is multiplied by that probability. The common remedy,
-the worst cost seen in the place of a failure, bends the model just where an optimum lies against such a wall:
-on two such problems (8 and 12 weights) it ended 3,000 and 40 times further from the optimum.
+reason, and is never used in the model of the cost. Instead, a second Gaussian process learns from the marks
+"worked" and "failed" how likely a candidate is to work, and the acquisition is multiplied by that
+probability. The usual method puts the worst cost so far in place of a failure. It distorts the model exactly
+where an optimum lies next to a region of failures: on two such problems (8 and 12 weights) it ended 3,000 and
+40 times further from the optimum.
 """
 
 from collections.abc import Callable
@@ -35,8 +35,8 @@ from scipy.spatial.distance import cdist
 
 
 class History(NamedTuple):
-    """In order of evaluation: theta (k, d), cost (k,), NaN if failed, failed: k
-    reasons, "" if it worked, incumbent (k,): least so far."""
+    """All evaluations in order: theta (k, d); cost (k,), NaN if failed; failed: k reasons, "" if it worked;
+    incumbent (k,): lowest cost so far."""
 
     theta: np.ndarray
     cost: np.ndarray
@@ -45,8 +45,7 @@ class History(NamedTuple):
 
 
 class SearchResult(NamedTuple):
-    """The weights theta (d,) that the search recommends, their cost as it
-    was evaluated, and everything that was evaluated."""
+    """The weights theta (d,) that the search recommends, their evaluated cost, and all evaluations."""
 
     theta: np.ndarray
     cost: float
@@ -67,21 +66,21 @@ class _Surrogate(NamedTuple):
 
 
 def _matern(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """kappa and its slope."""
+    """Returns kappa and its slope."""
     r = np.sqrt(5 * s)
     decay = np.exp(-r)
     return (1 + r + r * r / 3) * decay, -5 / 6 * (1 + r) * decay
 
 
 def _posterior(gp: _Surrogate, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation (41) at x (k, d)."""
+    """Returns mean and standard deviation (41) at x (k, d)."""
     k = gp.variance * _matern(cdist(x / gp.length, gp.points / gp.length, "sqeuclidean"))[0]
     v = k @ gp.inverse.T
     return k @ gp.weights, np.sqrt(np.maximum(gp.variance - (v * v).sum(axis=1), 1e-14 * gp.variance))
 
 
 def _posterior_slopes(gp: _Surrogate, x: np.ndarray) -> tuple[float, float, np.ndarray, np.ndarray]:
-    """Mean and standard deviation (41) at one x (d,), and their gradients (d,)."""
+    """Returns mean and standard deviation (41) at one x (d,), and their gradients (d,)."""
     apart = (x - gp.points) / gp.length
     kappa, slope = _matern((apart * apart).sum(axis=1))
     k, dk = gp.variance * kappa, 2 * gp.variance * slope[:, None] * apart / gp.length
@@ -91,8 +90,9 @@ def _posterior_slopes(gp: _Surrogate, x: np.ndarray) -> tuple[float, float, np.n
 
 
 def _surrogate(points: np.ndarray, values: np.ndarray, kernel) -> _Surrogate:
-    """scikit-learn's process at fixed kernel parameters, kernel = variance * Matern(length) + noise."""
-    # here: the import takes seconds, and few callers search
+    """Returns scikit-learn's process at fixed kernel parameters, kernel = variance * Matern(length) +
+    noise."""
+    # imported here because it takes seconds, and few callers search
     from sklearn.gaussian_process import GaussianProcessRegressor
 
     fitted = GaussianProcessRegressor(kernel, alpha=1e-10, optimizer=None).fit(points, values)
@@ -110,7 +110,7 @@ def _kernel(length: np.ndarray, *, noise: float, variance: float = 1.0):
 
 
 def _likeliest(kernel, points: np.ndarray, values: np.ndarray, iterations: int):
-    """The kernel at the maximum of likelihood times prior, from where it stands.
+    """Returns the kernel at a maximum of likelihood times prior, searched from its present parameters.
 
     Prior of the logarithms: variance N(0, 3^2), lengths N(log sqrt(d), 1) (distances in a cube grow with
     sqrt(d): Hvarfner et al. 2024), noise N(log 1e-6, 3^2).
@@ -137,8 +137,8 @@ def _likeliest(kernel, points: np.ndarray, values: np.ndarray, iterations: int):
 
 
 def _log_improvement(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """log h and h'/h of h(z) = phi(z) + z Phi(z); below z = -1, where the sum
-    cancels, as phi (1 + z Phi / phi) with 1 / z^2 at last."""
+    """Returns log h and h'/h of h(z) = phi(z) + z Phi(z). Below z = -1 the sum cancels, so h is computed as
+    phi (1 + z Phi / phi). Below z = -1e4 the bracket is constant, and h'/h is -z."""
     near, far = np.maximum(z, -1.0), np.clip(z, -1e4, -1.0)
     h = np.exp(-0.5 * near**2) / np.sqrt(2 * np.pi) + near * scipy.special.ndtr(near)
     mills = np.sqrt(np.pi / 2) * scipy.special.erfcx(-far / np.sqrt(2))
@@ -149,21 +149,29 @@ def _log_improvement(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-# an acquisition takes mean and standard deviation to (a, da/dmean, da/dstd); the least a is evaluated next
+# an acquisition maps mean and standard deviation to (a, da/dmean, da/dstd); the smallest a is evaluated next
 
 
 def _expected_improvement(mean, std, *, best: float):
-    """a = -log E[max(best - f, 0)] = -log(std h(z)), z = (best - mean) / std
+    """Returns the acquisition a and its slopes:
 
-    The logarithm keeps a slope where the improvement is flat."""
+    a = -log E[max(best - f, 0)] = -log(std h(z)), z = (best - mean) / std
+
+    The logarithm keeps a slope where the improvement is flat.
+    """
     z = (best - mean) / std
     log_h, ratio = _log_improvement(z)
     return -(np.log(std) + log_h), ratio / std, (ratio * z - 1) / std
 
 
 def _success(mean, std):
-    """a = -log P(the candidate works): P that the process of the marks (0 worked, -2
-    failed) is above -1; far from every mark P = 0.84."""
+    """Returns the acquisition a and its slopes:
+
+    a = -log P(the candidate works)
+
+    P is the probability that the process of the marks (0 worked, -2 failed) is above -1. Far from every mark
+    P = 0.84.
+    """
     z = (1 + mean) / std
     log_P = scipy.special.log_ndtr(z)
     ratio = np.exp(-0.5 * z * z - log_P) / np.sqrt(2 * np.pi)
@@ -176,8 +184,8 @@ Term = tuple[_Surrogate, Callable]
 def _least(
     terms: list[Term], candidates: np.ndarray, low: np.ndarray, high: np.ndarray, starts: int = 2
 ) -> np.ndarray:
-    """The point of the box low..high with the least sum of acquisitions: candidates
-    (k, d) screened, the best few refined by L-BFGS-B."""
+    """Returns the point of the box low..high with the smallest sum of acquisitions. Candidates (k, d) are
+    screened, and the best few refined by L-BFGS-B."""
 
     def objective(x):
         total, gradient = 0.0, np.zeros_like(x)
@@ -199,16 +207,16 @@ def _least(
 
 
 class _TrustRegion(NamedTuple):
-    """The side of the box around the best candidate, as a share of the domain, and the
-    run of successes and failures that may change it."""
+    """The side of the box around the best candidate, as a share of the domain, and the number of successes
+    and failures in a row, which may change it."""
 
     side: float = 0.8
     successes: int = 0
     failures: int = 0
 
     def after(self, better: bool) -> "_TrustRegion":
-        """Twice as wide after 3 improvements in a row, half after 4 vain
-        candidates; below 1/256 the search starts again wide."""
+        """Returns the region after one candidate: twice as wide after 3 improvements in a row, half as wide
+        after 4 failures in a row. Below 1/256 it starts again at 0.8."""
         successes, failures = (self.successes + 1, 0) if better else (0, self.failures + 1)
         if successes == 3:
             return _TrustRegion(min(2 * self.side, 1.6))
@@ -218,15 +226,15 @@ class _TrustRegion(NamedTuple):
 
 
 def _design(rng: np.random.Generator, d: int, count: int) -> np.ndarray:
-    """The first points (count, d): a scrambled Sobol sequence."""
-    from scipy.stats import qmc  # here: the import takes seconds
+    """Returns the first points (count, d): a scrambled Sobol sequence."""
+    from scipy.stats import qmc  # imported here because it takes seconds
 
     return qmc.Sobol(d, scramble=True, rng=rng).random_base2(int(np.ceil(np.log2(count))))[:count]
 
 
 def _terms(points: np.ndarray, costs: np.ndarray, kernel) -> list[Term]:
-    """What the next candidate should be good at: the acquisition of the costs
-    seen so far, and to work, where some have failed."""
+    """Returns the criteria for the next candidate: the acquisition of the costs so far, and, if some
+    candidates failed, the probability that it works."""
     worked, terms = np.isfinite(costs), []
     if worked.any():
         values = _standardised(costs[worked])
@@ -247,11 +255,11 @@ def _standardised(costs: np.ndarray) -> np.ndarray:
 def _next(
     points: np.ndarray, costs: np.ndarray, kernel, region: _TrustRegion, rng: np.random.Generator
 ) -> np.ndarray:
-    """The next point (d,) of the unit cube: in the trust region, longer where the cost changes slowly; while
-    nothing worked, anywhere.
+    """Returns the next point (d,) of the unit cube, from the trust region, whose sides are longer where the
+    cost changes slowly. While no candidate has worked, it may be anywhere.
 
-    512 points screen the box, half of them ten times nearer to its centre;
-    about 20 coordinates of each differ from the centre's.
+    512 points screen the box, half of them ten times nearer to its centre. About 20 coordinates of each
+    differ from the centre's.
     """
     d = points.shape[1]
     low, high, centre = np.zeros(d), np.ones(d), rng.random(d)
@@ -267,7 +275,7 @@ def _next(
 
 
 def evaluate(cost: Callable[[np.ndarray], float], theta: np.ndarray) -> tuple[float, str]:
-    """The cost, or NaN and the reason why there is none."""
+    """Returns the cost and "", or NaN and the reason why there is no cost."""
     try:
         value = float(cost(theta.copy()))
     except ValueError as failure:
@@ -293,13 +301,14 @@ def minimise(
     on_step: Callable[[History], None] | None = None,
     start: History | None = None,
 ) -> SearchResult:
-    """The weights of least cost among the candidates evaluated between lower (d,) > 0 and upper (d,); the
-    first `initial` of them are a scrambled Sobol set.
+    """Searches the weights of lowest cost between lower (d,) > 0 and upper (d,) with `evaluations`
+    candidates. The first `initial` are a scrambled Sobol set. Returns the best evaluated candidate.
 
-    `cost(theta)` takes weights (d,); a ValueError from it, or a number that is not finite, is a failure of
-    the candidate. `on_step(history)` is called after every evaluation. With that history as `start` and a
-    generator of the same seed, a run that was stopped goes on as if it had not been. The model costs O(k^3)
-    after k candidates: meant for hundreds. Raises ValueError where every candidate failed.
+    `cost(theta)` takes weights (d,); if it raises ValueError or returns a number that is not finite, the
+    candidate has failed. `on_step(history)` is called after every evaluation. With that history as `start`
+    and a generator of the same seed, a stopped run continues as if it had not been stopped. The model costs
+    O(k^3) after k candidates, so it is meant for hundreds. Raises ValueError if initial > evaluations, or if
+    every candidate failed.
     """
     if initial > evaluations:
         raise ValueError(
@@ -309,7 +318,7 @@ def minimise(
     span = np.log(upper / lower)
     nothing = History(np.empty((0, d)), np.empty(0), (), np.empty(0))
     start, history = nothing if start is None else start, nothing
-    # a generator for each candidate: what is drawn does not depend on where a run was stopped
+    # a generator for each candidate, so that its random numbers do not depend on where a run was stopped
     first, *later = rng.spawn(1 + evaluations)
     design, region, fitted = _design(first, d, initial), _TrustRegion(), False
     kernel = _kernel(np.full(d, np.sqrt(d)), noise=1e-6, variance=10.0)
@@ -351,12 +360,12 @@ def polished(
     evaluations: int,
     side: float = 1 / 8,
 ) -> SearchResult:
-    """The best of `found` after a pattern search of so many `evaluations` more (Hooke and Jeeves 1961): one
-    log-weight after the other a step up and down, the step first `side` of its range and halved where none of
-    them is better.
+    """Returns the best candidate after a pattern search of `evaluations` more candidates from the best of
+    `found` (Hooke and Jeeves 1961). It changes one log-weight after the other by a step up and down. The step
+    is first `side` of the weight's range, and is halved if no direction is better.
 
-    It needs neither a slope nor a model of the cost, which knows least at a wall beyond which candidates
-    fail, where an optimum often lies.
+    It needs neither a slope nor a model of the cost. Such a model is least reliable next to a region of
+    failures, where an optimum often lies.
     """
     span, history, best = np.log(upper / lower), found.history, found.cost
     point = np.log(found.theta / lower) / span
