@@ -20,7 +20,7 @@ from pipeline.report.shared.card import (
     or_no_figures,
     step,
 )
-from pipeline.report.shared.difference import Move
+from pipeline.report.shared.difference import Move, move
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.deposition import (
     BASELINE,
@@ -211,18 +211,10 @@ def _move(sources: Sources, structure: Structure) -> Move:
         False,
         "",
     )
-    score, before = structure.known().get(structure.chosen), _accepted(sources, structure)
-    if score is None:
-        why = NOT_JUDGED if structure.unknown() else "not measured"
-        return Move(question, before, Missing("not measured", "nothing to compare"), False, why)
-    now = count_of(score.error)
-    if before is None:
-        return Move(question, None, now, False, "new")
-    if before.value == now.value:
-        return Move(question, before, now, False, "unchanged")
-    if abs(now.value - before.value) <= SAME:
-        return Move(question, before, now, False, "within noise")
-    return Move(question, before, now, True, "better" if now.value < before.value else "worse")
+    score = structure.known().get(structure.chosen)
+    why = NOT_JUDGED if structure.unknown() else "not measured"
+    now = Missing(why, "nothing to compare") if score is None else count_of(score.error)
+    return move(question, _accepted(sources, structure), now, SAME)
 
 
 def _accepted(sources: Sources, structure: Structure) -> Figure | None:
@@ -231,9 +223,3 @@ def _accepted(sources: Sources, structure: Structure) -> Figure | None:
     then = parts.get(structure.part, {}).get(structure.material, {})
     score = then.get(then.get("chosen"))
     return count_of(float(score["rms_percent_of_on_off"])) if score else None
-
-
-def sentence(moves: Sequence[Move]) -> str:
-    """ "Deposition: 1 of 4 flow errors moved." """
-    changed = sum(move.moved for move in moves)
-    return f"Deposition: {changed} of {len(moves)} flow errors moved." if moves else ""

@@ -157,6 +157,7 @@ def answers(sources: Sources, scores: Board) -> list[dict[str, Any]]:
         ]
         own = scores.cells.get((mine, case))
         states = [state(lost, _lost(own)), state(gone, _lost(own, "stay"))] if own else [OPEN] * 2
+        change = setpoint_card.change(sources, case, own)
         rows.append(
             {
                 "simulator": SIMULATORS.get(case[0], case[0]),
@@ -169,7 +170,8 @@ def answers(sources: Sources, scores: Board) -> list[dict[str, Any]]:
                 "strip": charts.strip(lost, shown),
                 "stay": share_text(own.stay) if own else "not measured",
                 "stay_bad": states[1] == FAILED,
-                "change": setpoint_card.change(sources, case, own),
+                "change": change,
+                "worse": change.word == "worse" and state(change.question, change.now) == FAILED,
                 "decides": case == lowest,
             }
         )
