@@ -3,7 +3,6 @@ case, and what the camera's classifier is worth."""
 
 from typing import Any
 
-from pipeline.report.deposition.page import flat
 from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.setpoint import deciding as setpoint_deciding
 from pipeline.report.setpoint import harm as setpoint_harm
@@ -60,7 +59,6 @@ WORDS = (
     "reward",
     "accepted",
 )
-SECTIONS = ("setpoint_material", "train_classifier", "evaluate_setpoint")
 MOST = 12
 GOOD = 1  # of the classes under, good, over
 LANES = {"data_driven": "dd", "model_based": "mb", "baseline": "acc"}
@@ -114,7 +112,6 @@ def render(sources: Sources) -> str:
         simulators=SIMULATORS,
         **{function.__name__: function for function in (share_text, case_text, lasting, role, worst)},
         data=setpoint_vision.data(sources),
-        declared=[(section, flat(sources.declared.everything.get(section, {}))) for section in SECTIONS],
         words=words.chosen(sources, WORDS),
         from_board=sources.source("scoreboard", "choice"),
         from_classifier=sources.source("train_classifier", "classified"),
