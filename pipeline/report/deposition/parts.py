@@ -52,7 +52,7 @@ def _streams(table: Table) -> list[tuple[str, str]]:
     return list(dict.fromkeys(zip(table["part"].tolist(), table["material"].tolist(), strict=True)))
 
 
-def _judged(sources: Sources, name: str) -> Table | Missing:
+def _judged(sources: Sources, name: str) -> Table:
     """The rows of a table of forecasts whose stream is simulated or judged: no other has a figure."""
     table, unknown = sources.tables[name], unknown_streams(sources.evidence)
     if not unknown:
