@@ -321,7 +321,7 @@ def test_no_quick_look_passes_a_simulation_or_is_ready_for_a_trial():
     assert words_for(recorded=False, quick=False).passed.startswith("Pass (simulation)")
     states = ("passed", "failed", "passed")
     loops = [
-        Loop(name, "", state, "", "", "", "", recorded)
+        Loop(name, state, recorded)
         for name, state, recorded in zip(
             ("temperature", "deposition", "setpoint"), states, (True, False, False), strict=True
         )

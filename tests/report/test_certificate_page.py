@@ -44,14 +44,14 @@ def test_a_certificate_of_recordings_says_no_more_than_page_one(project):
     shown = SimpleNamespace(metrics={"export_controllers": artifacts.read_figures("export_controllers")})
     ready = Verdict("temperature", PASSED, "Ready for a supervised trial.", "", "", "", "", "pi")
     line = exported.lines(shown, ready)[0]
-    assert (line.state, line.word, line.why) == (PASSED, "May run.", "")
+    assert (line["state"], line["word"], line["why"]) == (PASSED, "May run.", "")
     for verdict in (
         ready._replace(winner="varx_riccati"),
         trust_first(ready, ready._replace(decision="Do not trust this model.", state=FAILED)),
     ):
         line = exported.lines(shown, verdict)[0]
-        assert (line.state, line.word) == (OPEN, "Certificate passed, not ready.")
-        assert line.why == f"Page one says: {verdict.decision} {verdict.lead}".strip()
+        assert (line["state"], line["word"]) == (OPEN, "Certificate passed, not ready.")
+        assert line["why"] == f"Page one says: {verdict.decision} {verdict.lead}".strip()
     # the pages of a machine whose page one names no such controller
     main()
     assert "May run" not in Page(PAGE).text + Page(INDEX).text

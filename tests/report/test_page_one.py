@@ -148,10 +148,10 @@ def test_a_file_too_large_to_lie_beside_the_pages_is_named_and_not_linked():
 def test_the_file_to_load_is_copied_beside_the_pages_byte_for_byte_where_it_is_small(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = Path("datasets/export_controllers/temperature/controller.json")
-    line = exported.ExportedLine("temperature", "passed", "", "PI", path.as_posix(), "", "1 file", "", "")
+    line = {"loop": "temperature", "file": path.as_posix()}
     read = type("Read", (), {"read": {}})()
     # what was not exported, and what is not there, is no link
-    for absent in (line, line._replace(file="")):
+    for absent in (line, line | {"file": ""}):
         assert exported.link(read, absent) == "" and exported.copies(read, [absent]) == {}
     path.parent.mkdir(parents=True)
     path.write_bytes(b"{}")

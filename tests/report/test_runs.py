@@ -112,9 +112,9 @@ def test_a_long_curve_keeps_its_first_and_its_last_sample():
         "reward": made.np.append(made.np.nan, made.np.arange(999) / 7),
     }
     ((name, curve),) = figures._agent(table)
-    assert (curve.x[0], curve.x[-1], curve.y[-1]) == (1.0, 999.0, 142.6)
-    assert len(curve.x) == figures.SAMPLES and name.startswith("Setpoint")
-    assert figures.restored(json.loads(figures.as_json({name: curve}))) == {name: curve}
+    assert (curve["x"][0], curve["x"][-1], curve["y"][-1]) == (1.0, 999.0, 142.6)
+    assert len(curve["x"]) == figures.SAMPLES and name.startswith("Setpoint")
+    assert json.loads(figures.as_json({name: curve})) == {name: curve}
 
 
 def test_without_an_accepted_run_the_page_shows_this_run_alone(project):

@@ -63,7 +63,7 @@ def test_runs_are_counted_before_the_clog_and_from_decision_90_to_the_end():
     found = deciding.traces(
         {name: column[shuffled] for name, column in rows.items()}, CASE, ["agent", "nobody", "do nothing"]
     )
-    np.testing.assert_array_equal(found.runs["agent"].flow, agent)
+    np.testing.assert_array_equal(found[0]["agent"].flow, agent)
     # 120 % is outside, and 90 % on the border after it
     assert deciding.finding(found).replace("\u202f", " ") == (
         "At decision 60 a clog leaves 75 % of the flow. Of three runs inside just before it, and from "

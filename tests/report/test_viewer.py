@@ -133,7 +133,7 @@ def test_a_small_table_is_copied_beside_the_page_and_a_large_one_linked(tmp_path
     path = Path("datasets/ingest/record.parquet")
     path.parent.mkdir(parents=True)
     path.write_bytes(b"x" * 1000)
-    read = {path.as_posix(): SourceFile("record", path.as_posix(), "ingest", "record 1", "0")}
+    read = {path.as_posix(): SourceFile("record", path.as_posix(), "ingest", "0")}
     [source] = linked(read).values()
     assert source.link == "data/ingest.record.parquet" and packed.size_of(source) == "1 kB"
     for bound in ("LARGEST_COPY", "LARGEST_COPIES"):

@@ -1,7 +1,7 @@
 """The page of the words."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 from pipeline.report.deposition import card as deposition_card
 from pipeline.report.setpoint import card as setpoint_card
@@ -33,84 +33,65 @@ def render_off(sources: Sources) -> str:
 ANOTHER = "The accepted run is of another machine: nothing to compare."
 
 
-class LoopChange(NamedTuple):
-    """One loop: the figures that moved beyond their noise ("settled error +0.39 °C · worse"), of how many
-    that both runs have."""
-
-    loop: str
-    moved: Sequence[str]
-    of: int
-
-
-class Changes(NamedTuple):
+def change(strong: str, text: str = "", alone: str = "", loops: Sequence[dict] = ()) -> dict[str, Any]:
     """Page one's answer: `strong`, then `text`; `alone` stands in the place of `strong` where the page finds,
     by script, that nothing but the machine differs. Then the loops."""
-
-    strong: str
-    text: str = ""
-    alone: str = ""
-    loops: Sequence[LoopChange] = ()
+    return {"strong": strong, "text": text, "alone": alone, "loops": loops}
 
 
-def changes(sources: Sources, judged: Judgement) -> Changes:
+def changes(sources: Sources, judged: Judgement) -> dict[str, Any]:
     """What changed since the accepted run, of all loops."""
     accepted = sources.accepted
     if sources.quick:
-        return Changes("A quick look is compared with no run.")
+        return change("A quick look is compared with no run.")
     if gap := gap_of(accepted):
-        return Changes("The accepted run cannot be read.", gap.sentence())
+        return change("The accepted run cannot be read.", gap.sentence())
     if accepted is None:
-        return Changes("First run: nothing to compare with.", "./run beadline accept marks this one as good.")
+        return change("First run: nothing to compare with.", "./run beadline accept marks this one as good.")
     loops = of_loops(sources, judged)
-    moved, compared = sum(len(loop.moved) for loop in loops), sum(loop.of for loop in loops)
+    moved, compared = sum(len(loop["moved"]) for loop in loops), sum(loop["of"] for loop in loops)
     beside = inputs(judged.changed) if judged.changed else ""
     if sources.another_machine:
         others = " and ".join(loop for loop in sources.verdicts if loop != "temperature")
         sentence = f"{others} {'are' if ' and ' in others else 'is'} compared.".capitalize()
-        return Changes(ANOTHER, sentence if others else "", loops=loops)
+        return change(ANOTHER, sentence if others else "", loops=loops)
     if not moved:
-        nothing = judged.changed is not None and judged.changed.empty and all(loop.of for loop in loops)
+        nothing = judged.changed is not None and judged.changed.empty and all(loop["of"] for loop in loops)
         strong = "Nothing changed; no figure moved." if nothing else "No figure moved beyond its noise."
-        return Changes(strong, "" if nothing else beside, loops=loops)
+        return change(strong, "" if nothing else beside, loops=loops)
     figures = f"{moved} of {compared} figures moved"
-    return Changes(f"{figures} beyond their noise.", beside, f"{figures} with the machine alone.", loops)
+    return change(f"{figures} beyond their noise.", beside, f"{figures} with the machine alone.", loops)
 
 
-def of_loops(sources: Sources, judged: Judgement) -> list[LoopChange]:
-    """Temperature: figures of the contestant and its rival; deposition: flow error of every stream; setpoint:
-    settled runs of every case of the default that counts."""
-    mine = [
-        (name, move)
+def of_loops(sources: Sources, judged: Judgement) -> list[dict[str, Any]]:
+    """The figures that moved beyond their noise ("settled error +0.39 °C · worse"), of how many that both
+    runs have. Temperature: figures of the contestant and its rival; deposition: flow error of every stream;
+    setpoint: settled runs of every case of the default that counts."""
+    temperature = [
+        (_titled(move, "" if name == judged.subject else f" of {in_a_sentence(name)}"), move)
         for name in dict.fromkeys((judged.subject, judged.rival))
         for move in judged.moved.get(name, [])
     ]
-    temperature = [
-        _moved(move, "" if name == judged.subject else f" of {in_a_sentence(name)}")
-        for name, move in mine
-        if move.moved
-    ]
     streams = deposition_card.moves(sources, known(structures(sources.evidence), []))
-    cases = setpoint_card.changes(sources)
-    loops = [
-        LoopChange("temperature", temperature, _both([move for _, move in mine])),
-        LoopChange("deposition", [_moved(move) for move in streams if move.moved], _both(streams)),
-        LoopChange(
-            "setpoint",
-            [f"{name} {change.text}" for name, change in cases if change.moved],
-            sum(change.text not in ("first run", "new") for _, change in cases),
-        ),
+    compared = {
+        "temperature": temperature,
+        "deposition": [(_titled(move), move) for move in streams],
+        "setpoint": setpoint_card.changes(sources),
+    }
+    return [
+        {
+            "loop": loop,
+            "moved": [f"{title} {move.text()}" for title, move in moves if move.moved],
+            "of": sum(move.before is not None and isinstance(move.now, Figure) for _, move in moves),
+        }
+        for loop, moves in compared.items()
+        if loop in sources.verdicts
     ]
-    return [loop for loop in loops if loop.loop in sources.verdicts]
 
 
-def _both(moves: Sequence[Move]) -> int:
-    """How many figures both runs have."""
-    return sum(move.before is not None and isinstance(move.now, Figure) for move in moves)
-
-
-def _moved(move: Move, whose: str = "") -> str:
+def _titled(move: Move, whose: str = "") -> str:
     title = f"{move.question.title}{whose}"
-    return f"{title[:1].lower()}{title[1:]} {move.text()}"
+    return f"{title[:1].lower()}{title[1:]}"
 
 
 def inputs(changed: Difference) -> str:

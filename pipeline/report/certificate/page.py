@@ -21,7 +21,7 @@ def render(sources: Sources, verdict: Verdict) -> str:
     lines = exported.lines(sources, verdict)
     shown = _certificate(sources, lines)
     whole = known(shown, None)
-    mine = next((line for line in known(lines, []) if line.loop == "temperature"), None)
+    mine = next((line for line in known(lines, []) if line["loop"] == "temperature"), None)
     passes = entry(comparison(sources.metrics), "best_reason", "passes") or {}
     return page.render(
         "certificate.html",
@@ -29,7 +29,7 @@ def render(sources: Sources, verdict: Verdict) -> str:
         sources=sources,
         title="Certificate",
         no_lines=gap_of(lines),
-        state={PASSED: "passed", FAILED: "failed"}.get(mine.state, "open") if mine else "open",
+        state=mine["state"] if mine and mine["state"] in (PASSED, FAILED) else "open",
         mine=mine,
         certificate=whole,
         missing_certificate=gap_of(shown),
@@ -48,11 +48,11 @@ def render(sources: Sources, verdict: Verdict) -> str:
 
 
 def _certificate(
-    sources: Sources, lines: Sequence[exported.ExportedLine] | Missing
+    sources: Sources, lines: Sequence[Mapping[str, str]] | Missing
 ) -> Mapping[str, Any] | Missing:
     """The certificate, or why there is none: in the words of export_controllers if it ran."""
     shown = sources.tables.get("certificate") or Missing(OPEN, "export_controllers has not run")
-    why = next((line.why for line in known(lines, []) if line.loop == "temperature"), "")
+    why = next((line["why"] for line in known(lines, []) if line["loop"] == "temperature"), "")
     if not gap_of(shown):
         return shown
     return Missing(OPEN, why) if why else shown

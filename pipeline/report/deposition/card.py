@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report.deposition.parts import KIND, MARK, draw_flows, flow_key, lines_of, real
+from pipeline.report.deposition.parts import KIND, MARK, around_worst, draw_flows, flow_key, lines_of, real
 from pipeline.report.shared import page
 from pipeline.report.shared.card import (
     PICTURE,
@@ -20,7 +20,7 @@ from pipeline.report.shared.card import (
     or_no_figures,
     step,
 )
-from pipeline.report.shared.difference import Move
+from pipeline.report.shared.difference import Move, move
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.deposition import (
     BASELINE,
@@ -36,7 +36,7 @@ from pipeline.verdict.deposition import (
     worst,
 )
 from pipeline.verdict.digits import THIN, band, count, decimals, number, percent
-from pipeline.verdict.evidence import Table, known, lookup, need, or_gap, or_nothing
+from pipeline.verdict.evidence import known, lookup, need, or_gap, or_nothing
 from pipeline.verdict.verdict import PASSED, Figure, Missing, Question, Verdict, count_of
 
 MOVES = "Plunger command to flow at the nozzle"
@@ -164,10 +164,10 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
     names = shown(verdict.winner or "", parts)
     used = verdict.winner or names[0]
     found = worst(parts, used)
-    rows = [] if found is None else _stretch(table, found[1], used)
-    if found is None or not len(rows):
+    part = found[1] if found else None
+    rows = around_worst(table, part.part, part.material, used, STRETCH_S) if part else ()
+    if part is None or not np.isfinite(table[f"{used}_mm3_per_s"][rows]).any():
         return Missing("not measured", "no flow of the part that decides was kept")
-    part = found[1]
     stretch = {key: table[key][rows] for key in table}
     drawn = [name for name in names if np.isfinite(stretch.get(f"{name}_mm3_per_s", np.nan)).any()]
     finding = f"{part.part}, material {part.material}, about the largest error:"
@@ -180,18 +180,6 @@ def deciding(sources: Sources, verdict: Verdict) -> Deciding | Missing:
         flow_key(drawn),
         page.in_viewer("signals", part=[part.part], material=[part.material], y=lines_of(drawn)),
     )
-
-
-def _stretch(table: Table, part: Structure, name: str) -> np.ndarray:
-    """Rows of the part within STRETCH_S about where the composer's flow is furthest from the wanted."""
-    mine = np.flatnonzero((table["part"] == part.part) & (table["material"] == part.material))
-    off = np.abs(table[f"{name}_mm3_per_s"][mine] - table["wanted_mm3_per_s"][mine])
-    if not len(mine) or not np.isfinite(off).any():
-        return mine[:0]
-    time = table["time_s"][mine]
-    middle = time[int(np.nanargmax(off))]
-    start = min(max(middle - STRETCH_S / 2, time.min()), max(time.max() - STRETCH_S, time.min()))
-    return mine[(time >= start) & (time <= start + STRETCH_S)]
 
 
 def moves(sources: Sources, parts: Sequence[Structure]) -> list[Move]:
@@ -211,18 +199,10 @@ def _move(sources: Sources, structure: Structure) -> Move:
         False,
         "",
     )
-    score, before = structure.known().get(structure.chosen), _accepted(sources, structure)
-    if score is None:
-        why = NOT_JUDGED if structure.unknown() else "not measured"
-        return Move(question, before, Missing("not measured", "nothing to compare"), False, why)
-    now = count_of(score.error)
-    if before is None:
-        return Move(question, None, now, False, "new")
-    if before.value == now.value:
-        return Move(question, before, now, False, "unchanged")
-    if abs(now.value - before.value) <= SAME:
-        return Move(question, before, now, False, "within noise")
-    return Move(question, before, now, True, "better" if now.value < before.value else "worse")
+    score = structure.known().get(structure.chosen)
+    why = NOT_JUDGED if structure.unknown() else "not measured"
+    now = Missing(why, "nothing to compare") if score is None else count_of(score.error)
+    return move(question, _accepted(sources, structure), now, SAME)
 
 
 def _accepted(sources: Sources, structure: Structure) -> Figure | None:
@@ -231,9 +211,3 @@ def _accepted(sources: Sources, structure: Structure) -> Figure | None:
     then = parts.get(structure.part, {}).get(structure.material, {})
     score = then.get(then.get("chosen"))
     return count_of(float(score["rms_percent_of_on_off"])) if score else None
-
-
-def sentence(moves: Sequence[Move]) -> str:
-    """ "Deposition: 1 of 4 flow errors moved." """
-    changed = sum(move.moved for move in moves)
-    return f"Deposition: {changed} of {len(moves)} flow errors moved." if moves else ""

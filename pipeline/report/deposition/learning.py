@@ -31,22 +31,15 @@ def _materials(table: Table) -> list[str]:
     return [str(name) for name in dict.fromkeys(table["material"])][:MATERIALS]
 
 
-def _routines(table: Table) -> list[str]:
-    return [str(number) for number in sorted(set(table["routine"].tolist()))]
-
-
 def _laws(table: Table) -> list[str]:
     there = set(table["law"].tolist())
     return [law for law in LAWS if law in there]
 
 
-def _trial(table: Table, material: str, law: str, trial: int) -> Table:
-    rows = (table["material"] == material) & (table["law"] == law) & (table["trial"] == trial)
-    return {name: values[rows] for name, values in table.items()}
-
-
-def _trials(table: Table, material: str, law: str) -> Table:
+def _rows(table: Table, material: str, law: str, trial: int | None = None) -> Table:
+    """The rows of a law on a material, of one trial or of all."""
     rows = (table["material"] == material) & (table["law"] == law)
+    rows &= True if trial is None else table["trial"] == trial
     return {name: values[rows] for name, values in table.items()}
 
 
@@ -59,7 +52,7 @@ def errors(sources: Sources) -> Picture:
     table = need(first_routine(sources.tables["trials"]))
     materials, laws, machine = _materials(table), _laws(table), real(sources)
     last = max(int(table["trial"].max()), 1)
-    curves = {law: {name: _trials(table, name, law) for name in materials} for law in laws}
+    curves = {law: {name: _rows(table, name, law) for name in materials} for law in laws}
     curves = {
         law: {name: mine for name, mine in of_law.items() if len(mine["trial"])}
         for law, of_law in curves.items()
@@ -199,10 +192,10 @@ def measured(sources: Sources) -> Picture:
     materials, machine = _materials(table), real(sources)
 
     def draw(material: str, column: int) -> list[Markup]:
-        last = int(_trials(table, material, "pixels")["trial"].max(initial=0))
+        last = int(_rows(table, material, "pixels")["trial"].max(initial=0))
         panels = []
         for trial in dict.fromkeys((0, last)):
-            mine = _trial(table, material, "pixels", trial)
+            mine = _rows(table, material, "pixels", trial)
             here = (filmed["material"] == material) & (filmed["trial"] == trial)
             if len(mine["time_s"]) and here.any():
                 panels += _measured_panels(
@@ -233,7 +226,7 @@ def measured(sources: Sources) -> Picture:
         page.origin(
             sources.source("lessons", "filmed"),
             material=materials,
-            routine=_routines(table),
+            routine=[str(routine) for routine in np.unique(table["routine"])],
             law="pixels",
             trial="0",
         ),

@@ -2,7 +2,6 @@
 what that took, and the pictures behind it."""
 
 import itertools
-import math
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from pipeline.report.shared.pictures import Picture, PictureColumn, as_picture, 
 from pipeline.report.shared.sources import Sources
 from pipeline.verdict.deposition import NAMES, NOT_JUDGED, OURS, Structure, data_driven, gamma, structures
 from pipeline.verdict.digits import THIN, number, short
-from pipeline.verdict.evidence import Table, entry, gap_of, known, lookup, need, need_figure, or_empty
+from pipeline.verdict.evidence import Table, entry, gap_of, known, need, need_figure, or_empty
 from pipeline.verdict.verdict import Missing, Question, count_of
 
 WORDS = (
@@ -41,8 +40,8 @@ WORDS = (
     "accepted",
 )
 TASKS = ("Start", "Corner", "Stop")
-# materials beside one another, and columns of the library, that are shown
-MATERIALS, MOST = 4, 80
+# materials beside one another that are shown
+MATERIALS = 4
 CHAIN = (
     ("gain", "Gain, mm³/s per mm"),
     ("time_constant_s", "Time constant, s"),
@@ -55,7 +54,6 @@ CHAIN = (
 # what a slicer takes, with decimals, and who takes it as a line
 SLICER = {"pressure_advance_s": 4, "smooth_time_s": 3, "flow_ratio": 3}
 SLICERS = ("Klipper", "Marlin", "OrcaSlicer")
-SECTIONS = ("printer", "camera", "train_ilc", "segment_library", "compose_parts")
 
 
 def render(sources: Sources) -> str:
@@ -95,7 +93,6 @@ def render(sources: Sources) -> str:
         assumptions=assumptions(sources),
         chains=chains(sources),
         slicer=slicer(sources),
-        columns=columns(sources),
         maps=deposition_parts.maps(sources),
         stretches=deposition_parts.stretches(sources),
         by_prints=deposition_parts.by_prints(sources),
@@ -105,7 +102,6 @@ def render(sources: Sources) -> str:
         forecasts=deposition_parts.forecasts(sources),
         extruded=deposition_parts.extruded(sources),
         refused=deposition_parts.refused(sources),
-        declared=declared(sources),
         words=words.chosen(sources, WORDS),
         from_scores=sources.source("scores", "compose_parts"),
         from_film=sources.source("filmed", "models", "train_ilc", "learned"),
@@ -138,26 +134,6 @@ def _answer(structure: Structure, move: Move | None, library: str) -> dict[str, 
 
 
 BOARD = ("basis", "priority", "superposition", "pressure_advance", "pressure_advance_lead", "on_off", "ilc")
-
-
-def declared(sources: Sources) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Sections of the parameters that this loop reads, flattened, as text."""
-    return [(section, flat(sources.declared.everything.get(section, {}))) for section in SECTIONS]
-
-
-def flat(data: Any, name: str = "") -> list[tuple[str, str]]:
-    if isinstance(data, dict):
-        return [
-            pair for key, value in data.items() for pair in flat(value, f"{name}.{key}" if name else str(key))
-        ]
-    if isinstance(data, list) and any(isinstance(item, dict) for item in data):
-        return [
-            (f"{name}[{i}]", ", ".join(f"{key} {value}" for key, value in item.items()))
-            for i, item in enumerate(data)
-        ]
-    if isinstance(data, list):
-        return [(name, ", ".join(map(str, data)))]
-    return [(name, "none" if data is None else str(data))]
 
 
 # ---- the library
@@ -302,14 +278,3 @@ def slicer(sources: Sources) -> list[dict[str, Any]]:
         | {key: [f"{one:.{places}f}" for one in values[key]] for key, places in SLICER.items()}
         for name, values in list(materials.items())[:MATERIALS]
     ]
-
-
-@as_table()
-def columns(sources: Sources) -> dict[str, Any]:
-    """The matrix (3), a row for each of its columns."""
-    table = need(sources.tables["library"])
-    rows = pd.DataFrame(table).head(MOST).to_dict("records")
-    for row in rows:
-        row["extreme"] = max(row["signal_mm"], key=abs, default=0.0)
-    Ts = float(known(lookup(sources.tables["learned"], "sample_time_s"), math.nan))
-    return {"rows": rows, "Ts": Ts, "more": max(len(table["task"]) - MOST, 0)}

@@ -2,7 +2,7 @@
 worst stretch, its lines, what limits it, and what was refused."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -52,7 +52,7 @@ def _streams(table: Table) -> list[tuple[str, str]]:
     return list(dict.fromkeys(zip(table["part"].tolist(), table["material"].tolist(), strict=True)))
 
 
-def _judged(sources: Sources, name: str) -> Table | Missing:
+def _judged(sources: Sources, name: str) -> Table:
     """The rows of a table of forecasts whose stream is simulated or judged: no other has a figure."""
     table, unknown = sources.tables[name], unknown_streams(sources.evidence)
     if not unknown:
@@ -230,26 +230,59 @@ def stretches(sources: Sources) -> Picture:
     """Wanted flow and that of every composer where the chosen one errs most, a row for each stream."""
     table, parts = _judged(sources, "signals"), known(structures(sources.evidence), [])
     chosen = {(one.part, one.material): one.chosen for one in parts if one.chosen}
-    worst_of_each = [
-        _stretch(table, part, material, chosen.get((part, material), "basis"))
-        for part, material in _streams(table)[:STREAMS]
-    ]
-    names = [
-        name
-        for name in (OURS, _library(sources), REFERENCE, BASELINE)
-        if any(np.isfinite(stretch.flows[name]).any() for stretch in worst_of_each)
-    ]
-    shown = [PictureColumn(stretch.name, "", "", [_panel(stretch, names)]) for stretch in worst_of_each]
-    worst = {name: max(stretch.off(name) for stretch in worst_of_each) for name in names}
+    streams = _streams(table)[:STREAMS]
+    errors = {stream: _errors(table, *stream, chosen.get(stream, "basis")) for stream in streams}
+    shown_first = (OURS, _library(sources), REFERENCE, BASELINE)
+    names = [name for name in shown_first if any(name in off for _, off in errors.values())]
+    columns = []
+    for (part, material), (rows, off) in errors.items():
+        told = ", ".join(
+            f"{NAMES[name].lower()} {percent(off.get(name, 0.0), 2)}"
+            f"{' (chosen)' * (name == chosen.get((part, material), 'basis'))}"
+            for name in names
+        )
+        alt = f"{part}, {material}: off the wanted flow, in % of a full line’s: {told}"
+        near = {key: values[rows] for key, values in table.items()}
+        columns.append(
+            PictureColumn(f"{part}, {material}", "", "", [draw_flows(near, names, alt, (566, 212))])
+        )
+    worst = {name: max(off.get(name, 0.0) for _, off in errors.values()) for name in names}
     return Picture(
         f"In its worst {STRETCH_S:g}{THIN}s, of any structure, the flow is off by at most: "
         f"{', '.join(f'{NAMES[name]} {percent(off, 2)}' for name, off in worst.items())} of "
         "a full line’s, r.m.s.",
-        shown,
+        columns,
         f"{'Forecast' if real(sources) else 'True'} flow in mm³/s against time in s, "
         f"the {STRETCH_S:g} s around the largest error of the signal that was chosen: " + flow_key(names),
         page.origin(sources.source("signals"), y=lines_of(names)),
     )
+
+
+def _errors(table: Table, part: str, material: str, chosen: str) -> tuple[np.ndarray, dict[str, float]]:
+    """Rows of the stretch about the largest error of the chosen composer, and the r.m.s. error there of every
+    one whose flow is known, in % of the steady flow."""
+    rows = around_worst(table, part, material, chosen, STRETCH_S)
+    stream = (table["part"] == part) & (table["material"] == material)
+    steady = float(table["wanted_mm3_per_s"][stream].max()) or 1.0
+    flows = {name: table[f"{name}_mm3_per_s"][rows] for name in NAMES if f"{name}_mm3_per_s" in table}
+    off = {name: flow - table["wanted_mm3_per_s"][rows] for name, flow in flows.items()}
+    return rows, {
+        name: 100 * float(np.sqrt(np.nanmean(error**2))) / steady
+        for name, error in off.items()
+        if np.isfinite(error).any()
+    }
+
+
+def around_worst(table: Table, part: str, material: str, name: str, seconds: float) -> np.ndarray:
+    """Rows of a stream within so many seconds about where the composer's flow is furthest from the wanted."""
+    mine = np.flatnonzero((table["part"] == part) & (table["material"] == material))
+    if not len(mine):
+        return mine
+    off = np.abs(np.nan_to_num(table[f"{name}_mm3_per_s"][mine]) - table["wanted_mm3_per_s"][mine])
+    time = table["time_s"][mine]
+    begin, end, middle = time.min(), time.max(), time[int(np.argmax(off))]
+    start = min(max(middle - seconds / 2, begin), max(end - seconds, begin))
+    return mine[(time >= start) & (time <= start + seconds)]
 
 
 def lines_of(names: Sequence[str]) -> list[str]:
@@ -257,56 +290,9 @@ def lines_of(names: Sequence[str]) -> list[str]:
     return [f"{name}_mm3_per_s" for name in ("wanted", *names)]
 
 
-class Stretch(NamedTuple):
-    """A few seconds of a stream: time in s, wanted flow, and the flow of every composer, in mm^3/s."""
-
-    name: str
-    chosen: str
-    t: np.ndarray
-    wanted: np.ndarray
-    flows: Table
-    steady: float
-
-    def off(self, name: str) -> float:
-        """r.m.s. error in % of the steady flow."""
-        return (
-            100 * float(np.sqrt(np.nanmean((self.flows[name] - self.wanted) ** 2))) / self.steady
-            if np.isfinite(self.flows[name]).any()
-            else 0.0
-        )
-
-
-def _stretch(table: Table, part: str, material: str, chosen: str) -> Stretch:
-    rows = (table["part"] == part) & (table["material"] == material)
-    t, wanted = table["time_s"][rows], table["wanted_mm3_per_s"][rows]
-    flows = {name: table[f"{name}_mm3_per_s"][rows] for name in NAMES if f"{name}_mm3_per_s" in table}
-    middle = float(t[np.argmax(np.abs(np.nan_to_num(flows[chosen]) - wanted))])
-    begin = min(max(middle - STRETCH_S / 2, float(t[0])), max(float(t[-1]) - STRETCH_S, float(t[0])))
-    near = (t >= begin) & (t <= begin + STRETCH_S)
-    return Stretch(
-        f"{part}, {material}",
-        chosen,
-        t[near],
-        wanted[near],
-        {name: flow[near] for name, flow in flows.items()},
-        float(wanted.max()) or 1.0,
-    )
-
-
 def flow_key(names: Sequence[str]) -> Markup:
     """Which line is whose in `draw_flows`."""
     return page.line_key([("wanted", "want"), *((NAMES[name].lower(), LINE[name]) for name in names)])
-
-
-def _panel(stretch: Stretch, names: list[str]) -> Markup:
-    off = ", ".join(
-        f"{NAMES[name].lower()} {percent(stretch.off(name), 2)}{' (chosen)' * (name == stretch.chosen)}"
-        for name in names
-    )
-    table = {f"{name}_mm3_per_s": stretch.flows[name] for name in names}
-    table |= {"time_s": stretch.t, "wanted_mm3_per_s": stretch.wanted}
-    alt = f"{stretch.name}: off the wanted flow, in % of a full line’s: {off}"
-    return draw_flows(table, names, alt, (566, 212))
 
 
 def draw_flows(

@@ -3,7 +3,7 @@ hold-out, with themselves, and with the inputs."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,25 +17,24 @@ from pipeline.verdict.digits import THIN, band, count, decimals, number, short
 from pipeline.verdict.evidence import Table, entry, known, lookup, need, need_figure
 from pipeline.verdict.identification import Fit, percent_of
 
-
-class Room(NamedTuple):
-    """How many panels stand beside one another, and what each of them has in px: four
-    at least, so that few do not grow into posters."""
-
-    across: int
-    width: int
-    height: int
-    css: str
-
-    @property
-    def left(self) -> int:
-        return 34 if self.css == "mb wide" else 28
+# width and height in px of each of so many panels beside one another
+SIZES = {4: (272, 120), 5: (213, 104), 6: (173, 92), 7: (152, 88)}
 
 
-def room(panels: int) -> Room:
-    across = min(max(panels, 4), MOST_INPUTS)
-    width, height = {4: (272, 120), 5: (213, 104), 6: (173, 92), 7: (152, 88)}[across]
-    return Room(across, width, height, "mb wide" if across < 6 else "mb")
+def across(panels: int) -> int:
+    """How many panels stand beside one another: four at least, so that few do not grow into posters."""
+    return min(max(panels, 4), MOST_INPUTS)
+
+
+def small_frame(
+    panels: int, x: charts.Axis, y: charts.Axis, above: int = 6, more: int = 0
+) -> tuple[charts.Frame, str]:
+    """The frame of one of so many panels, with `more` px on the left, and its class."""
+    width, height = SIZES[across(panels)]
+    wide = width > SIZES[6][0]
+    left = (34 if wide else 28) + more
+    frame = charts.Frame(x, y, width=width, height=height + 4 * more, left=left, above=above)
+    return frame, "mb wide" if wide else "mb"
 
 
 def as_matrix(id: str, title: str) -> Callable[[Callable[..., dict]], Callable[..., dict]]:
@@ -154,7 +153,7 @@ def whiteness(sources: Sources) -> Picture:
     shown = []
     for name in names:
         passed = bool(table["passed"][mine[name]].all())
-        panel = _stems(table, mine[name], y, room(len(names)), f"{name}, errors with themselves")
+        panel = _stems(table, mine[name], y, len(names), f"{name}, errors with themselves")
         shown.append(PictureColumn(name, "passed: noise" if passed else "failed: not noise", "", [panel]))
     bad = [name for name in names if not table["passed"][mine[name]].all()]
     text = (
@@ -175,7 +174,7 @@ def whiteness(sources: Sources) -> Picture:
 def cross(sources: Sources) -> dict[str, Any]:
     """Correlation of each output's one-step errors with each input."""
     table = need(sources.tables["residuals"])
-    other, size = table["against"] != table["output"], room(len(sources.declared.machine.inputs))
+    other, panels = table["against"] != table["output"], len(sources.declared.machine.inputs)
     y = _correlations(table, other)
     strength = np.nan_to_num(np.abs(table["correlation"]) / np.maximum(table["band"], 1e-300))
 
@@ -187,7 +186,7 @@ def cross(sources: Sources) -> dict[str, Any]:
             return {
                 "head": name,
                 "figure": "" if passed else "failed",
-                "panel": _stems(table, mine, y, size, f"{output} after {name}"),
+                "panel": _stems(table, mine, y, panels, f"{output} after {name}"),
                 "foot": "",
             }
 
@@ -222,7 +221,7 @@ def cross(sources: Sources) -> dict[str, Any]:
         "the test widens it for the number of lags. Left of zero, pale: feedback from errors to inputs, "
         f"no fault of the model.{more}",
         "origin": page.origin(sources.source("residuals")),
-        "across": size.across,
+        "across": across(panels),
     }
 
 
@@ -233,25 +232,19 @@ def _correlations(table: Table, rows: np.ndarray) -> charts.Axis:
     return charts.balanced(reach)
 
 
-def _stems(table: Table, rows: np.ndarray, y: charts.Axis, size: Room, name: str) -> Markup:
+def _stems(table: Table, rows: np.ndarray, y: charts.Axis, panels: int, name: str) -> Markup:
     lag, value, limit = table["lag"][rows], table["correlation"][rows], float(table["band"][rows][0])
     ends = dict.fromkeys((float(lag.min()), float(max(lag.min(), 0)), float(lag.max())))
-    frame = charts.Frame(
-        charts.Axis(float(lag.min()) - 1, float(lag.max()) + 1, tuple((k, number(k, 0)) for k in ends)),
-        y,
-        width=size.width,
-        height=size.height,
-        left=size.left,
-        above=6,
-    )
+    x = charts.Axis(float(lag.min()) - 1, float(lag.max()) + 1, tuple((k, number(k, 0)) for k in ends))
+    frame, css = small_frame(panels, x, y)
     # a lag outside of the band is marked only where the test over all
     # lags failed: one in a hundred leaves it by chance
     outside, judged = np.abs(np.nan_to_num(value)) > limit, lag >= 0
     marked = outside & ~table["passed"][rows]
     layers = [charts.tint(frame, -limit, limit), charts.level(frame, 0.0, "tk")]
     layers += [
-        charts.stems(frame, lag[part], value[part], css)
-        for part, css in ((judged & ~marked, "stem"), (judged & marked, "stem bad"), (~judged, "stem pale"))
+        charts.stems(frame, lag[part], value[part], stem)
+        for part, stem in ((judged & ~marked, "stem"), (judged & marked, "stem bad"), (~judged, "stem pale"))
     ]
     worst = int(np.abs(np.nan_to_num(np.where(judged, value, 0.0))).argmax())
     return charts.panel(
@@ -260,7 +253,7 @@ def _stems(table: Table, rows: np.ndarray, y: charts.Axis, size: Room, name: str
         alt=f"{name}: {int((outside & judged).sum())} of {int(judged.sum())} lags outside of "
         f"±{number(limit, 2)}, most {number(float(np.nan_to_num(value[worst])), 2)} at lag "
         f"{int(lag[worst])}",
-        css=size.css,
+        css=css,
         units=("samples", ""),
     )
 
@@ -292,14 +285,14 @@ def steps(sources: Sources) -> dict[str, Any]:
     """Response of each output to a step of each input, with the
     spread's band, and gain, time constant and delay."""
     table, dynamics = need(sources.tables["steps"]), need(sources.tables["dynamics"])
-    size = room(len(sources.declared.machine.inputs))
+    panels = len(sources.declared.machine.inputs)
     scales = {o.name: _reach(table, table["output"] == o.name) for o in sources.declared.machine.outputs}
 
     def cell(output: str, name: str) -> tuple[float, Callable[[], dict[str, Any]]]:
         mine = (table["output"] == output) & (table["input"] == name)
         row = int(np.flatnonzero((dynamics["output"] == output) & (dynamics["input"] == name))[0])
         strength = float(np.abs(table["response"][mine]).max())
-        return strength, lambda: _response(table, mine, dynamics, row, scales[output], size)
+        return strength, lambda: _response(table, mine, dynamics, row, scales[output], panels)
 
     rows, more = matrix(sources, cell)
     plants = _members(sources)
@@ -323,7 +316,7 @@ def steps(sources: Sources) -> dict[str, Any]:
         f"cut where it leaves the panel. τ: 1.5 times the way from 28.3 to 63.2{THIN}% of the largest "
         f"excursion; delay: what is left of the time to 63.2{THIN}%.{more}",
         "origin": page.origin(sources.source("steps", "dynamics"), y="response"),
-        "across": size.across,
+        "across": across(panels),
     }
 
 
@@ -346,18 +339,11 @@ def _reach(table: Table, rows: np.ndarray) -> charts.Axis:
 
 
 def _response(
-    table: Table, rows: np.ndarray, dynamics: Table, row: int, y: charts.Axis, size: Room
+    table: Table, rows: np.ndarray, dynamics: Table, row: int, y: charts.Axis, panels: int
 ) -> dict[str, Any]:
     time, sure = table["time_s"][rows], bool(dynamics["seen"][row])
     end = float(time[-1])
-    frame = charts.Frame(
-        charts.Axis(0, end, ((0.0, "0"), (end, short(end)))),
-        y,
-        width=size.width,
-        height=size.height + 8,
-        left=size.left + 2,
-        above=6,
-    )
+    frame, css = small_frame(panels, charts.Axis(0, end, ((0.0, "0"), (end, short(end)))), y, more=2)
     layers = [
         charts.ribbon(frame, time, table["low"][rows], table["high"][rows]),
         charts.level(frame, 0.0, "tk"),
@@ -368,25 +354,23 @@ def _response(
         tuple(float(dynamics[f"{key}{side}"][row]) for side in ("", "_low", "_high"))
         for key in ("gain", "peak")
     )
-    if not sure:
-        alt = f"{output} after {name}: sign not known, {_span(peak)} °C per %"
-        return {
-            "head": name,
-            "figure": _span(gain),
-            "panel": charts.panel(frame, layers, alt=alt, css=size.css, units=("s", "°C")),
-            "foot": "sign not known",
-        }
-    tau, delay = (f"{short(float(dynamics[key][row]), 2)}{THIN}s" for key in ("time_constant_s", "delay_s"))
-    elsewhere = not 0.8 < gain[0] / peak[0] < 1.05
-    figure = f"{number(peak[0], _places(peak))} ({_span(peak)})" + (
-        f", then {number(gain[0], _places(gain))} ({_span(gain)})" if elsewhere else ""
-    )
-    alt = f"{output} after {name}: {figure} °C per %; time constant {tau}, delay {delay}"
+    if sure:
+        tau, delay = (
+            f"{short(float(dynamics[key][row]), 2)}{THIN}s" for key in ("time_constant_s", "delay_s")
+        )
+        elsewhere = not 0.8 < gain[0] / peak[0] < 1.05
+        figure = f"{number(peak[0], _places(peak))} ({_span(peak)})" + (
+            f", then {number(gain[0], _places(gain))} ({_span(gain)})" if elsewhere else ""
+        )
+        foot, told = f"τ {tau}, delay {delay}", f"{figure} °C per %; time constant {tau}, delay {delay}"
+    else:
+        figure, foot, told = _span(gain), "sign not known", f"sign not known, {_span(peak)} °C per %"
+    alt = f"{output} after {name}: {told}"
     return {
         "head": name,
         "figure": figure,
-        "panel": charts.panel(frame, layers, alt=alt, css=size.css, units=("s", "°C")),
-        "foot": f"τ {tau}, delay {delay}",
+        "panel": charts.panel(frame, layers, alt=alt, css=css, units=("s", "°C")),
+        "foot": foot,
     }
 
 
@@ -477,18 +461,11 @@ def excitation(sources: Sources) -> Picture:
         need_figure(sources.metrics["identify_plant"], "excitation"),
     )
     y, shown = charts.linear(0, 1.1 * float(table["level"].max()) or 1.0, ticks=3), []
-    size = room(len(sources.declared.machine.inputs))
+    band_axis = charts.Axis(0, float(np.pi), ((0.0, "0"), (float(np.pi), "π")))
+    frame, css = small_frame(len(sources.declared.machine.inputs), band_axis, y, above=8)
     for signal in sources.declared.machine.inputs:
         mine = table["input"] == signal.name
         edges, level = np.append(table["low_rad"][mine], table["high_rad"][mine][-1]), table["level"][mine]
-        frame = charts.Frame(
-            charts.Axis(0, float(np.pi), ((0.0, "0"), (float(np.pi), "π"))),
-            y,
-            width=size.width,
-            height=size.height,
-            left=size.left,
-            above=8,
-        )
         own: Mapping = excited["inputs"].get(signal.name, {})
         small = f"{short(own['level'], 2)}{THIN}%, rank {own['rank']} of {excited['lags']}" if own else ""
         shown.append(
@@ -502,7 +479,7 @@ def excitation(sources: Sources) -> Picture:
                         [charts.line(frame, edges, np.append(level, level[-1]), steps=True)],
                         alt=f"{signal.name}: {small}; level {short(float(level.min()), 2)} to "
                         f"{short(float(level.max()), 2)} % in {len(level)} bands",
-                        css=size.css,
+                        css=css,
                     )
                 ],
             )

@@ -64,14 +64,4 @@ def drifts(judged: Judgement) -> str:
 def files(sources: Sources, verdict: Verdict) -> dict[str, dict[str, Any]]:
     """{loop: what leaves the house}; {} if nothing was exported."""
     lines = need(exported.lines(sources, verdict))
-    return {
-        line.loop: {
-            "path": line.file,
-            "sha256": line.sha256,
-            "state": line.state,
-            "word": line.word,
-            "certificate": line.certificate,
-            "link": exported.link(sources, line),
-        }
-        for line in lines
-    }
+    return {line["loop"]: line | {"link": exported.link(sources, line)} for line in lines}

@@ -41,14 +41,15 @@ def pictures(
     Raises ValueError where a mark has no figure or panel.
     """
     described = tomllib.loads(FILE.read_text(encoding="utf-8"))
+    every = [one | row for one in described[paper] for row in one.get("each", [{}])]
     context = {**KNOWN, **results, "tables": tables}
     crosses = defaultdict(list)
     for at, panel, x, y in marks:
         crosses[at, panel].append((x, y))
-    places = {(one["at"], i) for one in described[paper] for i in range(len(one.get("panels", ())))}
+    places = {(one["at"], i) for one in every for i in range(len(one.get("panels", ())))}
     if lost := sorted(crosses.keys() - places):
         raise ValueError(f"{paper}: expected a figure and panel for each mark, found none for {lost[0]}")
-    figures = [one for one in described[paper] if "needs" not in one or tables[one["needs"]]]
+    figures = [one for one in every if "needs" not in one or tables[one["needs"]]]
     return [_figure(one, described["panel"], context, crosses) for one in figures]
 
 

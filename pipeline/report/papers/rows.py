@@ -22,15 +22,6 @@ RULES = ("digits", "same", "at_most", "at_least", "within", "claim", "shape", "e
 ROUNDING = 1e-9
 
 
-class Entry(NamedTuple):
-    """A line of a table of the paper: its name, what is printed, ours, and whether they agree."""
-
-    name: str
-    printed: str
-    ours: str
-    verdict: str
-
-
 class PaperRow(NamedTuple):
     """A table, a figure or a number of a paper: its place there, what it says, printed and ours as text; ours
     with the smallest change that was found, and whether it holds with it; the verdict, how it is counted and
@@ -44,7 +35,7 @@ class PaperRow(NamedTuple):
     mended: bool
     verdict: str
     why: str
-    entries: list[Entry]
+    entries: list[dict[str, str]]
     marks: list[tuple[str, int, float, float]]
 
 
@@ -111,7 +102,7 @@ def _row(one: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -
     places = one.get("places")
     printed = _text(one.get("printed"), unit if not isinstance(one.get("printed"), str) else "", places)
     if entries:
-        agree = sum(entry.verdict == HOLDS for entry in entries)
+        agree = sum(entry["verdict"] == HOLDS for entry in entries)
         printed, shown = f"{len(entries)} entries", f"{agree} of {len(entries)} as printed"
     else:
         shown = _shown(ours, unit, one.get("ours_places", places))
@@ -141,11 +132,16 @@ def _marks(one: Mapping[str, Any]) -> list[tuple[str, int, float, float]]:
     return [(mark.get("figure", one["at"]), mark.get("panel", 0), *pair) for pair in pairs]
 
 
-def _entry(line: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -> Entry:
+def _entry(line: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -> dict[str, str]:
+    """A line of a table of the paper: its name, what is printed, ours, and whether they agree."""
     ours = _ours(line, found, metrics, place)
     agrees = _same(line["printed"], ours) if "places" not in line else _digits(line, ours)
-    texts = (_text(value, "", line.get("places")) for value in (line["printed"], ours))
-    return Entry(line["name"], *texts, HOLDS if agrees else FAILS)
+    texts = {"printed": line["printed"], "ours": ours}
+    return {
+        "name": line["name"],
+        "verdict": HOLDS if agrees else FAILS,
+        **{key: _text(value, "", line.get("places")) for key, value in texts.items()},
+    }
 
 
 def _ours(one: Mapping[str, Any], found: Mapping, metrics: Mapping, place: str) -> Any:
@@ -187,13 +183,13 @@ def look_up(path: str, found: Mapping[str, Any], metrics: Mapping[str, Any], pla
 # ---- verdicts
 
 
-def _verdict(one: Mapping[str, Any], ours: Any, entries: list[Entry]) -> str:
+def _verdict(one: Mapping[str, Any], ours: Any, entries: list[dict[str, str]]) -> str:
     """The verdict of a row by its rule."""
     rule, printed = one["rule"], one.get("printed")
     if rule == "not_judged" or gap_of(ours) or not one.get("judged", True):
         return OPEN
     if rule == "entries":
-        return HOLDS if all(entry.verdict == HOLDS for entry in entries) else FAILS
+        return HOLDS if all(entry["verdict"] == HOLDS for entry in entries) else FAILS
     if rule in ("claim", "shape"):
         return (HOLDS if rule == "claim" else SHAPE) if ours else FAILS
     if rule == "same":

@@ -222,13 +222,8 @@ def setpoint(judged: Mapping, classifier: Mapping) -> dict[str, Figure]:
 SAMPLES = 40
 
 
-class Curve(NamedTuple):
-    """A curve: names of its axes, its samples."""
-
-    across: str
-    up: str
-    x: list[float]
-    y: list[float]
+# {x, y: samples; across, up: names of the axes}
+Curve = Mapping[str, Any]
 
 
 def curves(tables: Mapping[str, Table | Missing]) -> dict[str, Curve]:
@@ -238,18 +233,13 @@ def curves(tables: Mapping[str, Table | Missing]) -> dict[str, Curve]:
         for table, read in READERS.items()
         if (rows := known(tables[table], None))
         for name, curve in read(rows)
-        if curve.x
+        if curve["x"]
     }
-
-
-def restored(stored: Any) -> dict[str, Curve]:
-    """The curves that an accepted run kept; none if it has none."""
-    return {name: Curve(**fields) for name, fields in (stored or {}).items()}
 
 
 def as_json(drawn: Mapping[str, Curve]) -> str:
     """The curves as a text of JSON, which `accept` keeps."""
-    return json.dumps({name: curve._asdict() for name, curve in drawn.items()}, ensure_ascii=False)
+    return json.dumps(drawn, ensure_ascii=False)
 
 
 def _search(table: Table) -> Iterator[tuple[str, Curve]]:
@@ -293,7 +283,8 @@ def _curve(across: str, up: str, x: np.ndarray, y: np.ndarray) -> Curve:
     kept = (
         known[np.unique(np.linspace(0, len(known) - 1, SAMPLES).round().astype(int))] if len(known) else known
     )
-    return Curve(across, up, [float(x[i]) for i in kept], [float(f"{y[i]:.4g}") for i in kept])
+    samples = {"x": [float(x[i]) for i in kept], "y": [float(f"{y[i]:.4g}") for i in kept]}
+    return {"across": across, "up": up, **samples}
 
 
 # table -> what reads its curves

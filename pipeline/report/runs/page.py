@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.report.about.page import ANOTHER, changes
-from pipeline.report.runs.figures import LOOPS, READERS, Curve, RunFigures, asked, curves, measured, restored
+from pipeline.report.runs.figures import LOOPS, READERS, Curve, RunFigures, asked, curves, measured
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.difference import accepted_on, changed_parameters, move
 from pipeline.report.shared.sources import Sources
@@ -48,7 +48,7 @@ def render(sources: Sources, judged: Judgement, metrics: Mapping[str, Any]) -> s
         sources=sources,
         title="This run beside the accepted one",
         heading=f"This run beside the accepted one{f' of {day}' if day else ''}",
-        lead=f"{told.strong} {told.text}".strip(),
+        lead=f"{told['strong']} {told['text']}".strip(),
         remedy="",
         tables=page.files(sources.source(*READERS)),
         measured=page.files(sources.source(*MEASURED_BY, "accepted")),
@@ -73,7 +73,7 @@ def accepted(sources: Sources) -> Run | None:
             },
         },
         run["params"],
-        restored(run.get("curves")),
+        run.get("curves") or {},
     )
 
 
@@ -208,19 +208,19 @@ def _panels(before: Mapping[str, Curve], now: Mapping[str, Curve]) -> list[dict[
 def _panel(name: str, before: Curve | None, now: Curve | None) -> dict[str, Any]:
     """This run's curve is solid, the accepted run's grey and dashed."""
     drawn = [(curve, css) for curve, css in ((before, "line thin dash"), (now, "line")) if curve]
-    x, y = (np.concatenate([curve[end] for curve, _ in drawn]) for end in (2, 3))
+    x, y = (np.concatenate([curve[end] for curve, _ in drawn]) for end in "xy")
     frame = charts.Frame(charts.linear(float(x.min()), float(x.max())), _scale(y), 340, 140, 44, 30, 22)
-    across, up = drawn[-1][0][:2]
-    ends = [f"{'accepted run' if 'dash' in css else 'this run'} {curve.y[-1]:g}" for curve, css in drawn]
+    shown = drawn[-1][0]
+    ends = [f"{'accepted run' if 'dash' in css else 'this run'} {curve['y'][-1]:g}" for curve, css in drawn]
     return {
         "title": name,
         "svg": charts.panel(
             frame,
-            [charts.line(frame, curve.x, curve.y, css) for curve, css in drawn],
+            [charts.line(frame, curve["x"], curve["y"], css) for curve, css in drawn],
             alt=f"{name}, last value: {', '.join(ends)}",
             css="mb wide",
-            title=f"{up}{', log' if frame.y.log else ''}",
-            across=across,
+            title=f"{shown['up']}{', log' if frame.y.log else ''}",
+            across=shown["across"],
         ),
     }
 

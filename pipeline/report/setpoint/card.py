@@ -19,11 +19,11 @@ from pipeline.report.shared.card import (
     or_no_figures,
     step,
 )
-from pipeline.report.shared.difference import Change
+from pipeline.report.shared.difference import Move, move
 from pipeline.report.shared.sources import Sources
 from pipeline.setpoint.agents.criteria import FLOW_BAND
 from pipeline.setpoint.controllers import NO_CONTROL as DOES_NOTHING
-from pipeline.verdict.digits import MINUS, THIN, band, number
+from pipeline.verdict.digits import THIN, band
 from pipeline.verdict.evidence import (
     Absent,
     entry,
@@ -50,7 +50,7 @@ from pipeline.verdict.setpoint import (
     within,
     worst,
 )
-from pipeline.verdict.verdict import FAILED, PASSED, Figure, Missing, Question, Verdict, state
+from pipeline.verdict.verdict import FAILED, PASSED, Figure, Missing, Question, Verdict
 
 MOVES = "Nozzle camera to setpoints"
 
@@ -189,32 +189,23 @@ def _text(scores: Board, name: str, case: Case, what: str) -> str:
 SAME = 0.05
 
 
-def change(sources: Sources, case: Case, cell: Cell | None) -> Change:
-    """How the settled runs of the default moved since the accepted run: beyond noise where the
-    interval of the one and as wide a one about the other do not overlap."""
-    if not known(sources.accepted, None) or cell is None or not isinstance(cell.settled, Figure):
-        return Change("first run")
+def change(sources: Sources, case: Case, cell: Cell | None) -> Move:
+    """How the settled runs of the default moved since the accepted run. Its figure has the interval of
+    today's: of as many runs, clustered as they are."""
+    question = Question(0, "", "Settled", "%", sources.declared.rules.settled_percent, True, "")
+    now = cell.settled if cell else Missing("not measured", "this case was not run")
+    if not known(sources.accepted, None) or isinstance(now, Missing):
+        return Move(question, None, now, False, "first run")
     stage = lookup(sources.accepted, "metrics.evaluate_setpoint")
     before = entry(stage, str(entry(stage, "default")), *case, "settled")
     if before is None:
-        return Change("new")
-    now = cell.settled
-    points = now.value - before
-    if abs(points) < SAME:
-        return Change("unchanged")
-    # the accepted figure has the interval of today's: of as many runs, clustered as they are
-    if now.low <= before + now.high - now.value and before - (now.value - now.low) <= now.high:
-        return Change("within noise")
-    question = Question(0, "", "Settled", "%", sources.declared.rules.settled_percent, True, "")
-    text = (
-        f"{'+' if points > 0 else MINUS}{number(abs(points), 1)}{THIN}points · "
-        f"{'better' if points > 0 else 'worse'}"
-    )
-    return Change(text, moved=True, worse=points < 0 and state(question, now) == FAILED)
+        return move(question, None, now)
+    by = 0.0 if abs(now.value - before) < SAME else before - now.value
+    return move(question, Figure(now.value + by, now.low + by, now.high + by), now)
 
 
 @or_empty
-def changes(sources: Sources) -> list[tuple[str, Change]]:
+def changes(sources: Sources) -> list[tuple[str, Move]]:
     """Every case of the default that counts, with how its settled runs moved."""
     scores = need(board(sources.evidence, sources.subject("setpoint")))
     counting = scores.counting(scores.default) if scores.default else []

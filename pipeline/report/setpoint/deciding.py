@@ -45,15 +45,8 @@ class Clog(NamedTuple):
     left: float
 
 
-class Traces(NamedTuple):
-    """The runs by controller, and what happens to them."""
-
-    runs: Mapping[str, Trace]
-    clog: Clog | None
-
-    @property
-    def last(self) -> int:
-        return max(one.flow.shape[1] for one in self.runs.values()) - 1
+# the runs by controller, and what happens to them
+Traces = tuple[dict[str, Trace], Clog | None]
 
 
 def trace(table: Table, case: Case, name: str) -> Trace | None:
@@ -93,7 +86,7 @@ def traces(table: Table | Missing, case: Case, names: Sequence[str]) -> Traces |
     if names[0] not in found:
         why = "no run of the case that decides was kept"
         return Missing("not measured", why, "Run ./run dvc repro evaluate_setpoint")
-    return Traces(found, clog(table, case))
+    return found, clog(table, case)
 
 
 def shown(board: Board) -> list[str]:
@@ -110,23 +103,23 @@ def picture(sources: Sources, board: Board | Missing) -> Picture:
     if case is None:
         raise Absent(Missing("not measured", "no controller was chosen"))
     found = need(traces(sources.tables["paths"], case, shown(board)))
-    told = finding(found)
-    flow = _flow(board, found, charts.Frame(_decisions(found), FLOW, *SIZE), alt=told)
+    runs, told = found[0], finding(found)
+    flow = _flow(board, found, charts.Frame(_decisions(runs), FLOW, *SIZE), alt=told)
     share = _inside(board, found, sources.declared.rules.settled_percent)
-    starts = count(len(found.runs[board.default].flow), "start")
+    starts = count(len(runs[board.default].flow), "start")
     return Picture(
         told,
         [
             PictureColumn("Flow", "per cent, against decisions", "", [flow]),
             PictureColumn("Runs inside", "per cent of them, against decisions", "", [share]),
         ],
-        key(board, found.runs)
-        + f". One run from each of {starts}, on the first pool of segments. {reading(found.runs)} Dashed: "
+        key(board, runs)
+        + f". One run from each of {starts}, on the first pool of segments. {reading(runs)} Dashed: "
         f"{BEST_FLOW - FLOW_BAND:g}–{BEST_FLOW + FLOW_BAND:g}{THIN}%. Inside: there, and "
         f"{BEST_TEMPERATURE:g}{THIN}±{THIN}{TEMPERATURE_BAND:g}{THIN}°C; level: "
         f"{sources.declared.rules.settled_percent:g}{THIN}% of the runs are to settle. What lies beyond the "
         "axis is not drawn.",
-        page.origin(sources.source("paths"), simulator=case[0], case=case[1], controller=list(found.runs)),
+        page.origin(sources.source("paths"), simulator=case[0], case=case[1], controller=list(runs)),
         title=case_text(case, whole=True),
     )
 
@@ -135,7 +128,7 @@ def picture(sources: Sources, board: Board | Missing) -> Picture:
 def panel(sources: Sources, board: Board, case: Case, names: Sequence[str]) -> Markup | Missing:
     """The flow of these controllers in a case, as page one draws it; why there is none."""
     found = need(traces(sources.tables["paths"], case, names))
-    frame = charts.Frame(_decisions(found), FLOW, *PICTURE, 34, 34, 16, 14)
+    frame = charts.Frame(_decisions(found[0]), FLOW, *PICTURE, 34, 34, 16, 14)
     return _flow(board, found, frame, alt=finding(found))
 
 
@@ -148,15 +141,16 @@ def reading(names: Iterable[str]) -> str:
 
 def finding(found: Traces) -> str:
     """What happens, and how many runs are inside before it, and how many stay."""
-    runs = count(len(next(iter(found.runs.values())).flow), "run")
-    stay = {name: int(one.inside[:, SETTLED_BY:].all(axis=1).sum()) for name, one in found.runs.items()}
-    if found.clog is None:
+    traced, happens = found
+    runs = count(len(next(iter(traced.values())).flow), "run")
+    stay = {name: int(one.inside[:, SETTLED_BY:].all(axis=1).sum()) for name, one in traced.items()}
+    if happens is None:
         listed = "; ".join(f"{name} {stay[name]}" for name in stay)
         return f"Of {runs} inside from decision {SETTLED_BY} to the end: {listed}."
-    before = {name: int(one.inside[:, found.clog.step - 1].sum()) for name, one in found.runs.items()}
+    before = {name: int(one.inside[:, happens.step - 1].sum()) for name, one in traced.items()}
     listed = "; ".join(f"{name} {before[name]} and {stay[name]}" for name in stay)
     return (
-        f"At decision {found.clog.step} a clog leaves {number(found.clog.left, 0)}{THIN}% of the flow. Of "
+        f"At decision {happens.step} a clog leaves {number(happens.left, 0)}{THIN}% of the flow. Of "
         f"{runs} inside just before it, and from decision {SETTLED_BY} to the end: {listed}."
     )
 
@@ -164,8 +158,8 @@ def finding(found: Traces) -> str:
 # ---- drawn
 
 
-def _decisions(found: Traces) -> charts.Axis:
-    return charts.linear(0, max(found.last, 1), ticks=5)
+def _decisions(runs: Mapping[str, Trace]) -> charts.Axis:
+    return charts.linear(0, max(1, *(one.flow.shape[1] - 1 for one in runs.values())), ticks=5)
 
 
 def key(board: Board, names: Iterable[str]) -> Markup:
@@ -175,21 +169,21 @@ def key(board: Board, names: Iterable[str]) -> Markup:
 
 def _flow(board: Board, found: Traces, frame: charts.Frame, *, alt: str) -> Markup:
     """Median and middle of the runs of everybody who acts, and each run that is left alone."""
-    layers: list[Markup] = []
-    styles = page.line_styles({name: role(board, name) for name in found.runs})
+    (runs, happens), layers = found, []
+    styles = page.line_styles({name: role(board, name) for name in runs})
     # what is left alone lies behind, the default in front
-    for name in reversed(list(found.runs)):
-        flow = found.runs[name].flow
+    for name in reversed(list(runs)):
+        flow = runs[name].flow
         if name == DOES_NOTHING:
-            runs = [np.where((q >= FLOW.low) & (q <= FLOW.high), q, np.nan) for q in np.unique(flow, axis=0)]
-            seen = [run for run in runs if np.isfinite(run).any()]
+            every = [np.where((q >= FLOW.low) & (q <= FLOW.high), q, np.nan) for q in np.unique(flow, axis=0)]
+            seen = [run for run in every if np.isfinite(run).any()]
             layers += [charts.line(frame, *corners(run), f"{styles[name]} way") for run in seen]
             continue
         step, *ends = corners(*np.percentile(flow, MIDDLE, axis=0))
         layers.append(charts.ribbon(frame, step, *ends, f"ribbon {page.MARKS[role(board, name)]}"))
         layers.append(charts.line(frame, *corners(np.median(flow, axis=0)), styles[name]))
     layers += [charts.level(frame, BEST_FLOW + border, "ref") for border in (-FLOW_BAND, FLOW_BAND)]
-    layers += _event(frame, found.clog)
+    layers += _event(frame, happens)
     return charts.panel(
         frame, layers, alt=alt, css="mb lead-picture", title="flow, %", across="decisions",
         units=("decisions", "%"),
@@ -207,14 +201,15 @@ def corners(*lines: np.ndarray) -> tuple[np.ndarray, ...]:
 def _inside(board: Board, found: Traces, limit: float) -> Markup:
     """The share of the runs that are inside, decision by decision."""
     y = charts.Axis(0, 104, tuple((float(v), str(v)) for v in (0, 25, 50, 75, 100)))
-    frame = charts.Frame(_decisions(found), y, *SIZE)
+    runs, happens = found
+    frame = charts.Frame(_decisions(runs), y, *SIZE)
     layers = [charts.level(frame, limit, "lim")]
-    styles, ends = page.line_styles({name: role(board, name) for name in found.runs}), []
-    for name in reversed(list(found.runs)):
-        share = 100 * found.runs[name].inside.mean(axis=0)
+    styles, ends = page.line_styles({name: role(board, name) for name in runs}), []
+    for name in reversed(list(runs)):
+        share = 100 * runs[name].inside.mean(axis=0)
         layers.append(charts.line(frame, *corners(share), styles[name], steps=True))
         ends.append(f"{name} {number(float(share[-1]), 0)} %")
-    layers += _event(frame, found.clog)
+    layers += _event(frame, happens)
     return charts.panel(
         frame,
         layers,

@@ -66,10 +66,6 @@ def decision_seconds(sources: Sources) -> float:
     return pixels["wait_s"] + everything["train_classifier"]["window"] / pixels["frame_rate_hz"]
 
 
-def _taken(harm: Harm) -> str:
-    return f"{share_text(harm.figure)} of good prints beyond ±{BEYOND[-1]}{THIN}% of flow"
-
-
 def _chart(board: Board, known: dict[str, Harm]) -> Markup:
     """A point for each controller, with both intervals."""
     most = max(harm.figure.value for harm in known.values())
@@ -101,7 +97,8 @@ def _chart(board: Board, known: dict[str, Harm]) -> Markup:
         layers,
         alt="Harm against recovery"
         if mine is None
-        else f"{board.default} takes {_taken(mine)} and recovers "
+        else f"{board.default} takes {share_text(mine.figure)} of good prints beyond ±{BEYOND[-1]}{THIN}% of "
+        "flow and recovers "
         f"{share_text(_recovered(board, board.default))} of clogs",
         css="mb wide big",
         title="% of clogs recovered, against % harmed",

@@ -3,7 +3,6 @@ case, and what the camera's classifier is worth."""
 
 from typing import Any
 
-from pipeline.report.deposition.page import flat
 from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.setpoint import deciding as setpoint_deciding
 from pipeline.report.setpoint import harm as setpoint_harm
@@ -60,7 +59,6 @@ WORDS = (
     "reward",
     "accepted",
 )
-SECTIONS = ("setpoint_material", "train_classifier", "evaluate_setpoint")
 MOST = 12
 GOOD = 1  # of the classes under, good, over
 LANES = {"data_driven": "dd", "model_based": "mb", "baseline": "acc"}
@@ -114,7 +112,6 @@ def render(sources: Sources) -> str:
         simulators=SIMULATORS,
         **{function.__name__: function for function in (share_text, case_text, lasting, role, worst)},
         data=setpoint_vision.data(sources),
-        declared=[(section, flat(sources.declared.everything.get(section, {}))) for section in SECTIONS],
         words=words.chosen(sources, WORDS),
         from_board=sources.source("scoreboard", "choice"),
         from_classifier=sources.source("train_classifier", "classified"),
@@ -157,6 +154,7 @@ def answers(sources: Sources, scores: Board) -> list[dict[str, Any]]:
         ]
         own = scores.cells.get((mine, case))
         states = [state(lost, _lost(own)), state(gone, _lost(own, "stay"))] if own else [OPEN] * 2
+        change = setpoint_card.change(sources, case, own)
         rows.append(
             {
                 "simulator": SIMULATORS.get(case[0], case[0]),
@@ -169,7 +167,8 @@ def answers(sources: Sources, scores: Board) -> list[dict[str, Any]]:
                 "strip": charts.strip(lost, shown),
                 "stay": share_text(own.stay) if own else "not measured",
                 "stay_bad": states[1] == FAILED,
-                "change": setpoint_card.change(sources, case, own),
+                "change": change,
+                "worse": change.word == "worse" and state(change.question, change.now) == FAILED,
                 "decides": case == lowest,
             }
         )

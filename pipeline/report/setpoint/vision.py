@@ -3,7 +3,7 @@ training, frames with key areas, what was held and foreign."""
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -14,7 +14,7 @@ from pipeline.report.shared.sources import Sources
 from pipeline.verdict.digits import number
 from pipeline.verdict.evidence import Absent, Table, entry, gap_of, instead, known, lookup, need, need_figure
 from pipeline.verdict.setpoint import CLASS_BORDERS, accuracy, share_in
-from pipeline.verdict.verdict import Figure, Missing
+from pipeline.verdict.verdict import Missing
 
 CLASSES = ("under", "good", "over")
 NAMES = {"": "Vision transformer", "svc": "Support vector machine", "width": "Width rule"}
@@ -150,38 +150,27 @@ IDEAL_BY_BIN = dict(
 )
 
 
-class Bin(NamedTuple):
-    """A bin of true flow in percent: how often its windows are right, what the ideal reader reaches there
-    (NaN where nobody knows), and whether a border of the classes is one of its ends."""
-
-    low: float
-    high: float
-    windows: int
-    right: Figure
-    ideal: float
-    beside: bool
-
-
-def bins(metrics: Mapping | Missing) -> list[Bin]:
-    """Of train_classifier.json, the bin that is right least often first."""
+def bins(metrics: Mapping | Missing) -> list[dict[str, Any]]:
+    """Of train_classifier.json the bins of true flow in percent, that which is right least often first: how
+    often its windows are right, what the ideal reader reaches there (NaN where nobody knows), and whether a
+    border of the classes is one of its ends."""
     found = need_figure(metrics, "by_flow")
-    rendered = lookup(metrics, "source") == "simulated"
+    ideal = IDEAL_BY_BIN if lookup(metrics, "source") == "simulated" else {}
     rows = [
-        Bin(
-            row["flow_low"],
-            row["flow_high"],
-            row["windows"],
-            figure,
-            IDEAL_BY_BIN.get(row["flow_low"], float("nan")) if rendered else float("nan"),
-            any(border in CLASS_BORDERS for border in (row["flow_low"], row["flow_high"])),
-        )
+        {
+            "low": row["flow_low"],
+            "high": row["flow_high"],
+            "windows": row["windows"],
+            "right": figure,
+            "ideal": ideal.get(row["flow_low"], math.nan),
+            "beside": row["flow_low"] in CLASS_BORDERS or row["flow_high"] in CLASS_BORDERS,
+        }
         for row in found
         if (figure := share_in(row)) is not None
     ]
-    rows.sort(key=lambda row: row.right.value)
     if not rows:
         raise Absent(Missing("not measured", "no bin of flow holds a window"))
-    return rows
+    return sorted(rows, key=lambda row: row["right"].value)
 
 
 @instead(lambda gap: {"picture": placeholder("by-flow", BY_FLOW, gap), "rows": ()})
@@ -190,7 +179,7 @@ def by_flow(sources: Sources) -> dict[str, Any]:
     and the width bias behind it, None where there is none."""
     metrics = sources.metrics["train_classifier"]
     found = bins(metrics)
-    ideal = any(row.ideal == row.ideal for row in found)
+    ideal = any(row["ideal"] == row["ideal"] for row in found)
     column = PictureColumn("Windows named rightly", "in per cent, by true flow", "", [_chart(found)])
     origin = page.origin(sources.source("train_classifier"))
     return {
@@ -202,43 +191,38 @@ def by_flow(sources: Sources) -> dict[str, Any]:
     }
 
 
-def _chart(rows: Sequence[Bin]) -> Markup:
+def _chart(worst_first: Sequence[Mapping[str, Any]]) -> Markup:
     """Bars with intervals, and the ideal reader as steps."""
-    rows = sorted(rows)
-    x = charts.Axis(rows[0].low, rows[-1].high, tuple((v, f"{v:g}") for v in _ticks(rows)))
+    rows, least = sorted(worst_first, key=lambda row: row["low"]), worst_first[0]
+    ends = [row["low"] for row in rows] + [rows[-1]["high"]]
+    # every second end, so that both borders are among them
+    x = charts.Axis(ends[0], ends[-1], tuple((v, f"{v:g}") for v in ends if v % 10 == 0))
     y = charts.Axis(0, 104, tuple((float(v), str(v)) for v in (0, 25, 50, 75, 100)))
     frame = charts.Frame(x, y, 568, 380, 42, 20, 24)
     layers = []
     for row in rows:
-        a, b = (float(v) for v in frame.px([row.low, row.high]))
-        top, low, high = (float(v) for v in frame.py([row.right.value, row.right.low, row.right.high]))
+        a, b = (float(v) for v in frame.px([row["low"], row["high"]]))
+        top, low, high = (float(v) for v in frame.py(row["right"][:3]))
         base, middle = frame.height - frame.below, (a + b) / 2
         layers.append(
             Markup(
                 '<rect class="bin{}" x="{:.1f}" width="{:.1f}" y="{:.1f}" height="{:.1f}"/>'
                 '<line class="whisk" x1="{:.1f}" x2="{:.1f}" y1="{:.1f}" y2="{:.1f}"/>'
             ).format(
-                " beside" if row.beside else "", a + 1, max(b - a - 2, 1), top, max(base - top, 0),
+                " beside" if row["beside"] else "", a + 1, max(b - a - 2, 1), top, max(base - top, 0),
                 middle, middle, high, low,
             )
         )  # fmt: skip
-    edges = np.array([edge for row in rows for edge in (row.low, row.high)])
-    ideal = np.repeat([row.ideal for row in rows], 2)
+    edges = np.array([edge for row in rows for edge in (row["low"], row["high"])])
+    ideal = np.repeat([row["ideal"] for row in rows], 2)
     if np.isfinite(ideal).any():
         layers.append(charts.line(frame, edges, ideal, "ref"))
-    least = min(rows, key=lambda row: row.right.value)
     return charts.panel(
         frame,
         layers,
-        alt=f"Windows are named rightly least often between {least.low:g} and {least.high:g} % of flow, "
-        f"{number(least.right.value, 0)} %",
+        alt=f"Windows are named rightly least often between {least['low']:g} and {least['high']:g} % of "
+        f"flow, {number(least['right'].value, 0)} %",
         css="dd wide big",
         title="% of windows, against % of flow",
         units=("%", "%"),
     )
-
-
-def _ticks(rows: Sequence[Bin]) -> list[float]:
-    """Every second edge, so that both borders are among them."""
-    edges = [row.low for row in rows] + [rows[-1].high]
-    return [edge for edge in edges if edge % 10 == 0]

@@ -2,7 +2,8 @@
 was sent, and where nothing was, with the reason."""
 
 import itertools
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,14 +23,6 @@ EPISODES, WIDTH, LEFT = 2, 1112, 36
 MOST_SENTENCES = 200
 # colours of the deposition page: too little, right, too much
 SHARES = (("p_under", "too-little"), ("p_good", "flag"), ("p_over", "too-much"))
-
-
-class Held(NamedTuple):
-    """Windows begin to end - 1, held for one reason."""
-
-    begin: int
-    end: int
-    reason: str
 
 
 @as_table()
@@ -60,7 +53,7 @@ def _strip(mine: Table, name: str, i: int) -> dict[str, Any]:
     t = mine["time_s"]
     edges = np.append(t, t[-1] + (t[-1] - t[-2] if len(t) > 1 else 1.0))
     x = charts.linear(float(t[0]), float(edges[-1]), ticks=10)
-    held = [Held(a, b, reason(str(mine["why"][a]))) for a, b in _alike(mine)]
+    held = [(a, b, reason(str(mine["why"][a]))) for a, b in _alike(mine)]
     inside = (np.abs(mine["flow_percent"] - BEST_FLOW) <= FLOW_BAND) & (
         np.abs(mine["temperature_degC"] - BEST_TEMPERATURE) <= TEMPERATURE_BAND
     )
@@ -71,7 +64,11 @@ def _strip(mine: Table, name: str, i: int) -> dict[str, Any]:
         else "outside at the end"
     )
     sent = int((mine["flow_move_percent"] != 0).sum())
-    windows = pd.DataFrame(held, columns=Held._fields).groupby("reason", sort=False)[["begin", "end"]].sum()
+    windows = (
+        pd.DataFrame(held, columns=["begin", "end", "reason"])
+        .groupby("reason", sort=False)[["begin", "end"]]
+        .sum()
+    )
     holds = "; ".join(f"{why}, {count(end - begin, 'window')}" for why, begin, end in windows.itertuples())
     finding = (
         f"{end[:1].upper()}{end[1:]}; the flow was moved {number(sent, 0)} times in "
@@ -108,7 +105,7 @@ def _frame(x: charts.Axis, y: charts.Axis, height: int, *, last: bool = False) -
     return charts.Frame(x, y, WIDTH, height, LEFT, 16 if last else 6, 16)
 
 
-def _shares(mine: Table, x: charts.Axis, edges: np.ndarray, held: list[Held]) -> Markup:
+def _shares(mine: Table, x: charts.Axis, edges: np.ndarray, held: Sequence[tuple[int, int, str]]) -> Markup:
     frame = _frame(x, charts.Axis(0, 1, ((0.0, "0"), (0.5, "0.5"), (1.0, "1"))), 112)
     px, low = frame.px(edges), np.zeros(len(mine["time_s"]))
     layers = []
@@ -119,14 +116,14 @@ def _shares(mine: Table, x: charts.Axis, edges: np.ndarray, held: list[Held]) ->
         )
         layers.append(Markup('<path class="{}" d="{}"/>').format(css, boxes))
         low = low + mine[column]
-    layers += [_hatch(frame, float(px[stretch.begin]), float(px[stretch.end])) for stretch in held]
+    layers += [_hatch(frame, float(px[begin]), float(px[end])) for begin, end, _ in held]
     return charts.panel(
         frame,
         layers,
         alt=f"Shares of under, good and over-extruded over {len(low)} windows: "
         f"under peaks at {number(float(mine['p_under'].max()), 2)}, "
         f"over at {number(float(mine['p_over'].max()), 2)}; "
-        f"{sum(stretch.end - stretch.begin for stretch in held)} windows were held",
+        f"{sum(end - begin for begin, end, _ in held)} windows were held",
         css="mb strip-why",
         title="share of under (brown), good (grey), over (green); hatched: nothing may be sent",
         x_ticks=False,
@@ -148,7 +145,7 @@ def _hatch(frame: charts.Frame, a: float, b: float) -> Markup:
     ).format(a, max(b - a, 1.0), top, height, "".join(strokes))
 
 
-def _flow(mine: Table, x: charts.Axis, held: list[Held], edges: np.ndarray) -> Markup:
+def _flow(mine: Table, x: charts.Axis, held: Sequence[tuple[int, int, str]], edges: np.ndarray) -> Markup:
     highest = max(160.0, float(max(mine["flow_percent"].max(), mine["flow_setpoint_percent"].max())) * 1.3)
     frame = _frame(x, charts.linear(0, highest, ticks=4), 150)
     t = mine["time_s"]

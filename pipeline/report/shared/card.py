@@ -49,12 +49,12 @@ class Deciding(NamedTuple):
 NEXT = re.compile(r"(?<=[.!?]) (?=[A-Z])")
 
 
-def first_sentence(text: str, room: int = ROOM) -> str:
+def first_sentence(text: str) -> str:
     """The first sentence; up to its first semicolon where that is long, and cut where that is too."""
     sentence = NEXT.split(text, maxsplit=1)[0]
-    if len(sentence) > room:
+    if len(sentence) > ROOM:
         sentence = sentence.split("; ", 1)[0].rstrip(".") + "."
-    return sentence if len(sentence) <= room else sentence[: room - 1].rstrip() + "…"
+    return sentence if len(sentence) <= ROOM else sentence[: ROOM - 1].rstrip() + "…"
 
 
 def of_verdict(verdict: Verdict, moves: str, step: dict[str, str], **rest: Any) -> Card:

@@ -127,11 +127,11 @@ def balanced(reach: float) -> Axis:
     return Axis(-reach, reach, tuple((value, number(value, places)) for value in (-tick, 0.0, tick)))
 
 
-def logarithmic(low: float, high: float, *, every: int = 0) -> Axis:
-    """Whole decades, every so many labelled."""
+def logarithmic(low: float, high: float) -> Axis:
+    """Whole decades, about five of them labelled."""
     first, last = math.floor(math.log10(low) + 1e-9), math.ceil(math.log10(high) - 1e-9)
     last = max(last, first + 1)
-    step = every or max(1, math.ceil((last - first) / 5))
+    step = max(1, math.ceil((last - first) / 5))
     ticks = tuple((10.0**k, _power(k)) for k in range(first, last + 1) if (k - first) % step == 0)
     return Axis(10.0**first, 10.0**last, ticks, True)
 
@@ -279,12 +279,12 @@ def line(frame: Frame, x, y, css: str = "line", *, steps: bool = False, most: in
     return Markup('<path class="{}" d="{}"/>').format(css, "".join(path))
 
 
-def level(frame: Frame, value: float, css: str, label: str = "", *, above: bool = True) -> Markup:
+def level(frame: Frame, value: float, css: str, label: str = "") -> Markup:
     """A horizontal line across the panel, such as a limit or the optimum, with its name at the right end."""
     y = float(frame.py(value))
     text = (
         Markup('<text x="{}" y="{}" text-anchor="end">{}</text>').format(
-            frame.width - frame.right, _n(y - 4 if above else y + 11), label
+            frame.width - frame.right, _n(y - 4), label
         )
         if label
         else ""
@@ -294,10 +294,10 @@ def level(frame: Frame, value: float, css: str, label: str = "", *, above: bool 
     )
 
 
-def tint(frame: Frame, low: float, high: float, css: str = "allow") -> Markup:
+def tint(frame: Frame, low: float, high: float) -> Markup:
     top, bottom = float(frame.py(high)), float(frame.py(low))
-    return Markup('<rect class="{}" x="{}" width="{}" y="{}" height="{}"/>').format(
-        css, frame.left, frame.width - frame.left - frame.right, _n(top), _n(max(bottom - top, 0))
+    return Markup('<rect class="allow" x="{}" width="{}" y="{}" height="{}"/>').format(
+        frame.left, frame.width - frame.left - frame.right, _n(top), _n(max(bottom - top, 0))
     )
 
 

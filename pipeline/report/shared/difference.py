@@ -39,14 +39,6 @@ class Move(NamedTuple):
         return f"{sign}{size}{THIN + unit if unit else ''} · {self.word}"
 
 
-class Change(NamedTuple):
-    """How a figure moved since the accepted run, as a cell of a table says it."""
-
-    text: str
-    moved: bool = False
-    worse: bool = False
-
-
 class Difference(NamedTuple):
     """Recordings (`inputs`), `parameters` (name, before, now), `code` (changed, unchanged, not recorded) and
     `artifacts` that are not those of the accepted run. `machine`: the accepted run's, if nothing but the
@@ -177,15 +169,15 @@ def _recorded(figures: Mapping[str, Any]) -> dict[str, dict[str, Figure | Missin
     }
 
 
-def move(question: Question, before: Figure | None, now: Figure | Missing) -> Move:
-    """A figure moves if its band and the earlier one do not overlap."""
+def move(question: Question, before: Figure | None, now: Figure | Missing, same: float = 0.0) -> Move:
+    """A figure moves if its band and the earlier one do not overlap, and lie further apart than `same`."""
     if isinstance(now, Missing):
         return Move(question, None, now, False, now.state)
     if before is None:
         return Move(question, None, now, False, "new")
     if before[:3] == now[:3]:
         return Move(question, before, now, False, "unchanged")
-    if now.low <= before.high and before.low <= now.high:
+    if now.low <= before.high + same and before.low <= now.high + same:
         return Move(question, before, now, False, "within noise")
     return Move(
         question, before, now, True, "better" if (now.value < before.value) != question.at_least else "worse"

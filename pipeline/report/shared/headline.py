@@ -12,40 +12,25 @@ from pipeline.verdict.digits import count, listed, shortened
 from pipeline.verdict.evidence import known
 
 NAMES = ("temperature", "deposition", "setpoint")
-MOVES = ("heaters to barrel", "plunger to flow", "camera to setpoints")
 ABSENT = "not measured"
 
 
 class Loop(NamedTuple):
-    """One loop: its state (passed, failed, open, not measured), and whole sentences; `lead` is bold and
-    vermillion where it failed. `recorded`: judged from recordings of the machine, not on simulated ones."""
+    """One loop: its state (passed, failed, open, not measured); `recorded`: judged from recordings of the
+    machine, not on simulated ones."""
 
     name: str
-    moves: str
     state: str
-    decision: str
-    lead: str
-    reason: str
-    remedy: str
     recorded: bool = False
 
 
 def loops(sources: Sources) -> list[Loop]:
     """The loops that are on: the verdict of each as the head of page one counts it."""
-    verdicts = sources.verdicts
     return [
         Loop(
-            name,
-            moves,
-            verdict.word if name == "temperature" or verdict.subject else ABSENT,
-            verdict.decision,
-            verdict.lead,
-            verdict.reason,
-            verdict.remedy,
-            not verdict.rehearsal,
+            name, verdict.word if name == "temperature" or verdict.subject else ABSENT, not verdict.rehearsal
         )
-        for name, moves in zip(NAMES, MOVES, strict=True)
-        if (verdict := verdicts.get(name))
+        for name, verdict in sources.verdicts.items()
     ]
 
 

@@ -46,14 +46,11 @@ class Declared(NamedTuple):
 
 class SourceFile(NamedTuple):
     """One file that the pages show: what it is called here (a table's name, or the stage of metrics), the
-    stage that wrote it, name and version of its schema, the digest of its bytes, and where it is found from
-    the pages.
-    """
+    stage that wrote it, the digest of its bytes, and where it is found from the pages."""
 
     name: str
     path: str
     stage: str
-    schema: str
     sha256: str
     link: str = ""
 
@@ -160,13 +157,13 @@ def collect(
     figures: dict[str, Any] = {}
     tables: dict[str, Any] = {}
     for stage, path in metrics.items():
-        figures[stage] = _read(read, path, stage, stage, "figures", artifacts.read_json)
+        figures[stage] = _read(read, path, stage, stage, artifacts.read_json)
         if switched_off(figures[stage]):
             figures[stage] = OFF
             del read[path]
         elif isinstance(figures[stage], Missing):
             absent[path] = figures[stage]
-    for name, stage, file, kind, reader in _tables(declared.machine):
+    for name, stage, file, reader in _tables(declared.machine):
         if figures.get(stage) is OFF:
             tables[name] = OFF
             continue
@@ -174,7 +171,7 @@ def collect(
         if name == "set_points" and not artifacts.exists(path):
             tables[name] = {}  # no set-point was recorded
             continue
-        tables[name] = _read(read, path, name, stage, kind, reader)
+        tables[name] = _read(read, path, name, stage, reader)
         if name == "printer_pid" and not tables[name]:
             del read[path]
         elif isinstance(tables[name], Missing):
@@ -186,16 +183,12 @@ def collect(
     for name, stage in (("frames", "train_ilc"), ("nozzle_frames", "train_classifier")):
         for frame in [] if isinstance(tables[name], Missing) else tables[name]:
             path = frame["path"]
-            read[path] = SourceFile("frame", path, stage, "JPEG", artifacts.sha256(path))
+            read[path] = SourceFile("frame", path, stage, artifacts.sha256(path))
     before = (
-        _read(read, accepted, "accepted", "accept", "accepted", read_accepted)
-        if artifacts.exists(accepted)
-        else None
+        _read(read, accepted, "accepted", "accept", read_accepted) if artifacts.exists(accepted) else None
     )
     night = (
-        _read(read, NIGHTLY, "nightly", "nightly", "nightly", artifacts.read_json)
-        if artifacts.exists(NIGHTLY)
-        else None
+        _read(read, NIGHTLY, "nightly", "nightly", artifacts.read_json) if artifacts.exists(NIGHTLY) else None
     )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
     read = linked(read)
@@ -258,67 +251,61 @@ def digest(data: Any) -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], Any]]]:
-    """(name, stage, file, schema, reader) of every table that the pages show."""
+def _tables(machine: Plant) -> list[tuple[str, str, str, Callable[[str], Any]]]:
+    """(name, stage, file, reader) of every table that the pages show."""
 
-    def table(schema: schemas.Schema) -> tuple[str, Callable[[str], Table]]:
-        return f"{schema.name} {schema.version}", lambda path: artifacts.read_table(path, schema)
+    def table(schema: schemas.Schema) -> Callable[[str], Table]:
+        return lambda path: artifacts.read_table(path, schema)
 
-    def arrays(name: str) -> tuple[str, Callable[[str], Table]]:
-        return f"{name} 1", lambda path: artifacts.read_arrays(path, name, 1)
+    def arrays(path: str) -> Table:
+        return artifacts.read_arrays(path, "plant", 1)
 
     return [
-        ("record", "ingest", "record.parquet", *table(schemas.record(machine.acting, machine.outputs))),
-        ("set_points", "ingest", "set_points.parquet", *table(schemas.set_points(machine.outputs))),
-        ("quality", "ingest", "quality.parquet", *table(schemas.QUALITY)),
-        ("printer_pid", "ingest", "printer_pid.json", "printer_pid", artifacts.read_json),
-        ("plant", "identify_plant", "plant.parquet", *arrays("plant")),
-        ("order", "identify_plant", "order.parquet", *table(schemas.ORDER)),
-        ("holdout", "identify_plant", "holdout.parquet", *table(schemas.holdout(machine.outputs))),
-        ("residuals", "identify_plant", "residuals.parquet", *table(schemas.RESIDUALS)),
-        ("steps", "identify_plant", "steps.parquet", *table(schemas.STEPS)),
-        ("dynamics", "identify_plant", "dynamics.parquet", *table(schemas.DYNAMICS)),
-        ("first_order", "identify_plant", "first_order.parquet", *table(schemas.FIRST_ORDER)),
-        ("poles", "identify_plant", "poles.parquet", *table(schemas.POLES)),
-        ("levels", "identify_plant", "levels.parquet", *table(schemas.LEVELS)),
-        ("weights", "tune_weights", "weights.json", "weights", artifacts.read_json),
-        ("tuning", "tune_weights", "history.parquet", *table(schemas.TUNING)),
-        ("cases", "evaluate_temperature", "cases.parquet", *table(schemas.CASES)),
+        ("record", "ingest", "record.parquet", table(schemas.record(machine.acting, machine.outputs))),
+        ("set_points", "ingest", "set_points.parquet", table(schemas.set_points(machine.outputs))),
+        ("quality", "ingest", "quality.parquet", table(schemas.QUALITY)),
+        ("printer_pid", "ingest", "printer_pid.json", artifacts.read_json),
+        ("plant", "identify_plant", "plant.parquet", arrays),
+        ("order", "identify_plant", "order.parquet", table(schemas.ORDER)),
+        ("holdout", "identify_plant", "holdout.parquet", table(schemas.holdout(machine.outputs))),
+        ("residuals", "identify_plant", "residuals.parquet", table(schemas.RESIDUALS)),
+        ("steps", "identify_plant", "steps.parquet", table(schemas.STEPS)),
+        ("dynamics", "identify_plant", "dynamics.parquet", table(schemas.DYNAMICS)),
+        ("first_order", "identify_plant", "first_order.parquet", table(schemas.FIRST_ORDER)),
+        ("poles", "identify_plant", "poles.parquet", table(schemas.POLES)),
+        ("levels", "identify_plant", "levels.parquet", table(schemas.LEVELS)),
+        ("weights", "tune_weights", "weights.json", artifacts.read_json),
+        ("tuning", "tune_weights", "history.parquet", table(schemas.TUNING)),
+        ("cases", "evaluate_temperature", "cases.parquet", table(schemas.CASES)),
         (
             "trajectories",
             "evaluate_temperature",
             "trajectories.parquet",
-            *table(schemas.trajectories(machine.inputs, machine.outputs)),
+            table(schemas.trajectories(machine.inputs, machine.outputs)),
         ),
-        ("trials", "train_ilc", "trials.parquet", *table(TRIALS)),
-        ("lessons", "train_ilc", "lessons.parquet", *table(LESSONS)),
-        ("filmed", "train_ilc", "filmed.parquet", *table(FILMED)),
-        ("models", "train_ilc", "models.json", "models", artifacts.read_json),
-        ("frames", "train_ilc", "frames/frames.json", "frames 1", _frames),
-        ("library", "segment_library", "library.parquet", *table(LIBRARY)),
-        ("learned", "segment_library", "learned.json", "learned", artifacts.read_json),
-        ("signals", "compose_parts", "signals.parquet", *table(SIGNALS)),
-        ("scores", "compose_parts", "scores.parquet", *table(SCORES)),
-        ("prints", "compose_parts", "prints.parquet", *table(PRINTS)),
-        ("tasks", "compose_parts", "tasks.parquet", *table(TASKS)),
-        ("lines", "compose_parts", "lines.parquet", *table(LINES)),
-        ("conformance", "compose_parts", "conformance.json", "conformance", artifacts.read_json),
-        ("classified", "train_classifier", "classified.parquet", *table(CLASSIFIED)),
-        ("reliability", "train_classifier", "reliability.parquet", *table(RELIABILITY)),
-        ("course", "train_classifier", "course.parquet", *table(CLASSIFIER_CURVE)),
-        ("nozzle_frames", "train_classifier", "frames/frames.json", "frames 1", _frames),
-        ("agents", "train_agent", "agents.parquet", *table(AGENT_CURVE)),
-        ("scoreboard", "evaluate_setpoint", "scoreboard.parquet", *table(SCOREBOARD)),
-        ("paths", "evaluate_setpoint", "paths.parquet", *table(PATHS)),
-        ("decisions", "evaluate_setpoint", "decisions.parquet", *table(DECISIONS)),
-        ("choice", "evaluate_setpoint", "choice.json", "choice", artifacts.read_json),
-        (
-            "certificate",
-            "export_controllers",
-            "temperature/certificate.json",
-            "certificate 1",
-            artifacts.read_json,
-        ),
+        ("trials", "train_ilc", "trials.parquet", table(TRIALS)),
+        ("lessons", "train_ilc", "lessons.parquet", table(LESSONS)),
+        ("filmed", "train_ilc", "filmed.parquet", table(FILMED)),
+        ("models", "train_ilc", "models.json", artifacts.read_json),
+        ("frames", "train_ilc", "frames/frames.json", _frames),
+        ("library", "segment_library", "library.parquet", table(LIBRARY)),
+        ("learned", "segment_library", "learned.json", artifacts.read_json),
+        ("signals", "compose_parts", "signals.parquet", table(SIGNALS)),
+        ("scores", "compose_parts", "scores.parquet", table(SCORES)),
+        ("prints", "compose_parts", "prints.parquet", table(PRINTS)),
+        ("tasks", "compose_parts", "tasks.parquet", table(TASKS)),
+        ("lines", "compose_parts", "lines.parquet", table(LINES)),
+        ("conformance", "compose_parts", "conformance.json", artifacts.read_json),
+        ("classified", "train_classifier", "classified.parquet", table(CLASSIFIED)),
+        ("reliability", "train_classifier", "reliability.parquet", table(RELIABILITY)),
+        ("course", "train_classifier", "course.parquet", table(CLASSIFIER_CURVE)),
+        ("nozzle_frames", "train_classifier", "frames/frames.json", _frames),
+        ("agents", "train_agent", "agents.parquet", table(AGENT_CURVE)),
+        ("scoreboard", "evaluate_setpoint", "scoreboard.parquet", table(SCOREBOARD)),
+        ("paths", "evaluate_setpoint", "paths.parquet", table(PATHS)),
+        ("decisions", "evaluate_setpoint", "decisions.parquet", table(DECISIONS)),
+        ("choice", "evaluate_setpoint", "choice.json", artifacts.read_json),
+        ("certificate", "export_controllers", "temperature/certificate.json", artifacts.read_json),
     ]
 
 
@@ -358,9 +345,7 @@ def _frames(path: str) -> list[dict[str, Any]]:
     return frames
 
 
-def _read(
-    read: dict[str, SourceFile], path: str, name: str, stage: str, schema: str, reader: Callable[[str], Any]
-) -> Any:
+def _read(read: dict[str, SourceFile], path: str, name: str, stage: str, reader: Callable[[str], Any]) -> Any:
     if not artifacts.exists(path):
         kept = Path(path).parts[1] == "papers"
         remedy = "git checkout datasets/papers" if kept else f"./run dvc repro {stage}"
@@ -369,7 +354,7 @@ def _read(
         content = reader(path)
     except ValueError as error:
         return Missing("failed", str(error))
-    read[path] = SourceFile(name, path, stage, schema, artifacts.sha256(path))
+    read[path] = SourceFile(name, path, stage, artifacts.sha256(path))
     return content
 
 

@@ -49,12 +49,6 @@ ANSWERS = {
 
 
 FIXED = {
-    "gap": (
-        "Gap to the optimum",
-        "By how many per cent a controller’s cost (squared errors and inputs, summed) lies above that of the "
-        "best possible one on the same plant, counted unclipped and without an integrator. It "
-        "decides nothing.",
-    ),
     "quantile": (
         "90 % quantile",
         "Nine in ten of all cases (plants, starts, references, noise) are better than this figure. "

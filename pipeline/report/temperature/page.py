@@ -32,7 +32,6 @@ WORDS = (
     "cost",
     "crossings",
     "false_stops",
-    "gap",
     "margin_disk",
     "margin_delay",
     "spread",

@@ -373,11 +373,14 @@ def _signal(
     )
 
 
+FLAWS = 40  # of a record that the page lists at most
+
+
 @as_table(rows=[], more=0)
-def flaws(sources: Sources, most: int = 40) -> dict[str, Any]:
+def flaws(sources: Sources) -> dict[str, Any]:
     """The quality findings, those of quarantined recordings first."""
     table = need(sources.tables["quality"])
     quality = pd.DataFrame(table)
     quality = quality.assign(used=quality["kind"] != "quarantined", start=quality["start_s"].fillna(0.0))
     quality = quality.sort_values(["used", "recording", "signal", "kind", "start"])
-    return {"rows": quality.head(most).to_dict("records"), "more": max(len(quality) - most, 0)}
+    return {"rows": quality.head(FLAWS).to_dict("records"), "more": max(len(quality) - FLAWS, 0)}

@@ -1,5 +1,5 @@
 """The table of the temperature page: every contestant as deployed over all plants, median and 90 %
-quantile, and what stands below it: the gap with its convention, bounds that bind, who was refused."""
+quantile, and what stands below it: bounds that bind, who was refused."""
 
 import math
 from collections.abc import Mapping
@@ -57,7 +57,6 @@ def scorecard(sources: Sources, judgement: Judgement, words: Mapping[str, str]) 
             _row(sources, asked[key], judged, judgement, words.get(key, "")) for key in ORDER if key in asked
         ],
         "source": entry(compared, "limits", "source") or "declared",
-        "gaps": _gaps(compared, judged),
         "bounds": [(name, entry(compared, "contestants", name, "at_bound")) for name in judged],
         "broken": [(name, entry(compared, "redesigned", name)) for name in judged],
         "refused": refused(metrics),
@@ -185,22 +184,6 @@ def _worst_title(own: Any, key: str) -> str:
 
 
 # ---- below the table
-
-
-def _gaps(compared: Mapping[str, Any], names: list[str]) -> list[dict[str, Any]]:
-    """The gap of every contestant with its convention; it decides nothing."""
-    question = Question(0, "gap", "", "%", math.inf, False, "")
-    gaps = {name: entry(compared, "contestants", name, "gap") for name in names if name not in YARDSTICKS}
-    return [
-        {
-            "name": name,
-            "convention": gap.get("convention") or "",
-            "median": worded(question, finite(gap.get("median_percent")), 2),
-            "q90": worded(question, finite(gap.get("q90_percent")), 2),
-        }
-        for name, gap in gaps.items()
-        if isinstance(gap, Mapping)
-    ]
 
 
 def infeasible(sources: Sources) -> list[Mapping[str, Any]]:
