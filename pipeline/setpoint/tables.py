@@ -96,7 +96,7 @@ AGENT_CURVE = Schema(
 
 
 def _share(name: str, meaning: str) -> tuple[Column, ...]:
-    """A share of runs with its interval and what it rests on: four columns."""
+    """Returns four columns: a share of runs, its interval, and its number of independent runs."""
     return (
         Column(f"{name}_percent", FLOAT, "percent", meaning, 0, 100, nullable=True),
         Column(
