@@ -1,5 +1,5 @@
-"""By what a run of a controller of setpoints is judged: plain numbers, so that a page can name them without a
-simulator."""
+"""Criteria by which a run of a setpoint controller is scored: plain numbers, so that a page can use them
+without a simulator."""
 
 FLOW_BAND, TEMPERATURE_BAND = 10.0, 5.0  # about 100 % and 210 °C
 SETTLED_BY, DWELL_UNTIL, STEPS = (
@@ -14,6 +14,6 @@ BACK_BAND = 15.0  # within which a half clogged nozzle shall be brought back
 
 
 def harm_bar(case: str, *, perfect: float, in_band: float) -> float | None:
-    """Percent of runs from good starts that may leave +-25 % in this case; None if nobody is barred: of a
-    camera of another scale no rule can know better, and harm is only told."""
+    """Returns the percentage of runs from good starts that may leave +-25 % in this case. None means no
+    limit: no controller can detect a camera of another scale, so harm is only reported."""
     return {"perfect": perfect, "in band": in_band}.get(case)

@@ -219,11 +219,10 @@ def run(
 ) -> Episodes:
     """Simulates episodes that start at rest at the setpoints start (E, 2).
 
-    If a window's classes cannot be told apart, the controller does not act, but it receives the window as
-    evidence: it updates its memory, and its answer is not sent. Windows that are blocked for another reason
-    are not passed to it. Lambda's clock counts only the windows that led to an action, so that a blocked
-    window does not cost the temperature its action. Each episode has its own random generator and does not
-    depend on the others. Raises ValueError if `disturbances` has another number of episodes.
+    If a window must not be acted on (its reason is not ACTS), nothing is sent, and the controller's memory is
+    kept as it was. Lambda's clock counts only the windows that led to an action, so that a blocked window
+    does not cost the temperature its action. Each episode has its own random generator and does not depend on
+    the others. Raises ValueError if `disturbances` has another number of episodes.
     """
     E, tick_s = len(start), 1.0 / loop.frame_rate_hz
     if len(disturbances.clog) != E:

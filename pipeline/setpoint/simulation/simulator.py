@@ -57,9 +57,9 @@ class Observation(NamedTuple):
 
     `shares` (3,): of under, good and over in the window, sum 1. `named`: the window's class 0, 1, 2.
     `flow_seen`: flow that the window shows, in percent of nominal; NaN if the camera shows classes only.
-    `flow_move`: change of the flow setpoint since the controller's last observation, in percent, after limits
-    (0 if it was held constant). `temperature`: u_hat; `target`: u_bar, in °C. `step`: t, counts all
-    decisions, also those without an action.
+    `flow_move`: change of the flow setpoint since the controller's last observation, in percent, after
+    limits. `temperature`: u_hat; `target`: u_bar, in °C. `step`: t, counts decisions; with a real or rendered
+    camera, only those that led to an action.
     """
 
     shares: jax.Array
