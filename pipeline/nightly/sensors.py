@@ -1,13 +1,13 @@
-"""Sensors of a recording that stand still while the machine moves: what the supervisor of a controller says,
-asked of the record sample by sample.
+"""Finds sensors of a recording that stand still while the machine moves, by the same test as a controller's
+supervisor, sample by sample.
 
-The supervisor's forecasts last 36 samples, in which a slow zone hardly moves. A record is there as a whole,
-so it is asked again with samples 4 and 16 times as far apart: the model over s samples is
+The supervisor's forecasts last 36 samples, in which a slow zone hardly moves. A record is available as a
+whole, so it is also tested with samples 4 and 16 times as far apart. The model over s samples is
 
     x(t+s) = A^s x(t) + (I + A + ... + A^(s-1)) (B u + b),    u the mean of the inputs meanwhile
 
-While a good loop holds a zone, the model foretells no move that could be missing. A sensor whose noise is not
-small beside its step then still turns back every few samples, and one that is stuck does not.
+If a good loop holds a zone constant, the model predicts no move that could be missing. But a sensor whose
+noise is not small compared with its step still turns back every few samples, and a stuck one does not.
 """
 
 from collections.abc import Iterator, Sequence
@@ -33,8 +33,8 @@ MISSING = 30.0  # reversals that a sensor that turns back so often owes, before 
 
 
 class SensorFault(NamedTuple):
-    """An output that stands still or gives no number: its name, which of KINDS, why in one sentence, and the
-    sample of the record by which that is certain."""
+    """An output that stands still or gives no number: its name, one of KINDS, the reason in one sentence, and
+    the sample of the record at which it is certain."""
 
     output: str
     kind: int
@@ -43,20 +43,21 @@ class SensorFault(NamedTuple):
 
     @property
     def rank(self) -> tuple[int, int]:
-        """The surest first."""
+        """Returns a key that sorts the most certain fault first."""
         return self.kind, self.sample
 
 
 def smallest_changes(records: Sequence[Segments], unmoved: float = supervise.MOST_STEP_DEGC) -> np.ndarray:
-    """The smallest change (p,) of each sensor in records, in °C; `unmoved` if there is none."""
+    """Returns the smallest change (p,) of each sensor in the records, in °C; `unmoved` if it never
+    changes."""
     moves = np.concatenate([np.abs(np.diff(y, axis=0)) for record in records for _, y in record])
     least = np.where(moves > 1e-9, moves, np.inf).min(axis=0)
     return np.where(np.isfinite(least), least, unmoved)
 
 
 def reversals(records: Sequence[Segments]) -> np.ndarray:
-    """The share (p,) of samples of honest records at which each sensor turns back after one sample: it is
-    low for a sensor whose noise is small beside its step."""
+    """Returns the fraction (p,) of samples of honest records at which each sensor turns back after one
+    sample. It is low for a sensor with noise that is small compared with its step."""
     turns = np.concatenate([
         np.diff(y[:-1], axis=0) * np.diff(y[1:], axis=0) < 0 for record in records for _, y in record
     ])  # fmt: skip
@@ -72,9 +73,9 @@ def faults(
     steps: np.ndarray,
     reversals: np.ndarray,
 ) -> list[SensorFault]:
-    """The sensors that are in doubt in a record of inputs u (T, m) and readings y (T, p), masked ones too, by
-    the machine's model, and by noise (p,) and steps (p,) of its sensors in °C and their share of reversals
-    (p,) in honest records; the surest first."""
+    """Returns the sensors in doubt in a record of inputs u (T, m) and readings y (T, p), including masked
+    ones, the most certain first. `model`: of the machine; `noise` (p,) and `steps` (p,): of its sensors in
+    °C; `reversals` (p,): their fraction of reversals in honest records."""
     wired = supervise.Machine(
         tuple(Signal(one.name, supervise.PERCENT, one.low, one.high) for one in machine.inputs),
         tuple(
@@ -106,8 +107,8 @@ def faults(
 def _find_stuck(
     s: Supervision, machine: supervise.Machine, segments: Segments, reversals: np.ndarray
 ) -> Iterator[SensorFault]:
-    """Every sensor that gives one and the same reading for a third of the record while its heater is on, and
-    that should have turned back many times meanwhile."""
+    """Yields every sensor that gives the same reading for a third of the record while its heater is on,
+    although it should have turned back many times meanwhile."""
     begin, samples = 0, sum(len(y) for _, y in segments)
     for u, y in segments:
         for i in np.flatnonzero(reversals >= RESTLESS):
@@ -124,12 +125,12 @@ def _find_stuck(
 
 
 def _heater_of(s: Supervision, output: int) -> int:
-    """The input that an output answers to most."""
+    """Returns the input to which an output responds most."""
     return int(s.input_of[int((s.of_input == output).argmax())])
 
 
 def _rarer(model: Plant, spacing: int) -> Plant:
-    """The model over `spacing` samples."""
+    """Returns the model over `spacing` samples."""
     total, power = np.zeros_like(model.A), np.eye(model.n)
     for _ in range(spacing):
         total, power = total + power, power @ model.A
@@ -141,7 +142,7 @@ def _rarer(model: Plant, spacing: int) -> Plant:
 def _follow(
     s: Supervision, machine: supervise.Machine, segments: Segments, spacing: int, steps: np.ndarray
 ) -> Iterator[SensorFault]:
-    """Every sensor in doubt, once."""
+    """Yields every sensor in doubt, once."""
     silent, told, begin = np.zeros(len(s.d), int), set(), 0
     last = sum(len(y) for _, y in segments) - 1
     heaters = [_heater_of(s, i) for i in range(len(s.d))]
