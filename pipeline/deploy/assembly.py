@@ -29,9 +29,9 @@ from pipeline.temperature.tracking import reached_state, riccati
 
 LEAK = 0.9999  # of the drift, kept a step
 RESTLESS = 1e8  # condition of I - A above which a plant has no rest of its own
-WEAK_SHARE = 1e-3  # of what inputs move most, below which they are not said to hold a temperature
-HURRIED = 0.1  # of an innovation, by which the drift follows in manual
-# what takes over if the law is left: the control that the machine has, or a PI in its place
+WEAK_SHARE = 1e-3  # of the largest effect of inputs; with less they do not count as holding a temperature
+HURRIED = 0.1  # fraction of an innovation by which the drift follows in manual
+# control that takes over in the safe mode: the machine's own, or a PI in its place
 OWN_CONTROL = ("printer_pid", "pi", "pi_simc")
 
 

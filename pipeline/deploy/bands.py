@@ -31,7 +31,7 @@ from pipeline.temperature.plant import hold_output, observability_matrix, padded
 from pipeline.temperature.tracking import gains
 
 Segments = Sequence[np.ndarray]
-LEAST_BLOCKS = 20  # fewer blocks than this say little of how far a resample may lie
+LEAST_BLOCKS = 20  # with fewer blocks the scatter of resamples is not reliable
 DIVERGED = 1e6  # °C
 CHUNK = 50  # resamples whose moments are held at once
 
@@ -147,7 +147,7 @@ def predictors(of: Moments, taken: np.ndarray, data: Rows, *, gain_spread: float
         normal, right = S[:k, :k].copy(), S[:k, k:]
         if gain_spread:
             normal += gain_spread**2 * _own_moments(S, of, m, p, data.N)
-        normal[np.diag_indices(k)] *= 1 + 1e-10  # a signal that stands still in these blocks
+        normal[np.diag_indices(k)] *= 1 + 1e-10  # in case a signal is constant in these blocks
         solution = scipy.linalg.cho_solve(scipy.linalg.cho_factor(normal, lower=True), right)
         residual = S[k:, k:] - solution.T @ right - right.T @ solution + solution.T @ S[:k, :k] @ solution
         covariance[i] = residual / max(S[0, 0] - k, 1.0)

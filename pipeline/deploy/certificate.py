@@ -53,12 +53,12 @@ class Rules(NamedTuple):
     samples: float = 5.0  # for each unknown of a window model
     moves: float = 0.002  # least share of an input's range that it moves by itself
     ahead: int = 20
-    # share of the newest record's movement over `ahead` samples that the model may miss beyond what the
+    # fraction of the newest record's movement over `ahead` samples that the model may miss, beyond what the
     # record's own window model misses
     unexplained: float = 0.5
     noise: float = 0.3  # deviation of a settled mean as a share of the settled error's limit
-    # what the record's window models may extrapolate to at rest without inputs: a room, wider by the error of
-    # a straight line from hot to cold
+    # temperatures at rest without inputs to which the record's window models may extrapolate: those of a
+    # room, widened by the error of a straight line from hot to cold
     extrapolated_degC: tuple[float, float] = (-50.0, 110.0)
     reach: float = 0.5  # of the recorded span, by which references may lie beyond it
 
@@ -226,9 +226,9 @@ def plain(value: Any) -> Any:
 # ---- compared with the limits
 
 MEASURED, CERTIFIED = "measured.json", "certified.json"
-# stands in the exported files for the SHA-256 of the certificate, which depends on the limits
+# placeholder in the exported files for the SHA-256 of the certificate, which depends on the limits
 PLACE = "@certificate@"
-# signals, samples, evidence, loop: the rules of a group are all asked if every group before it passed
+# signals, samples, evidence, loop: all rules of a group are evaluated if every group before it passed
 GROUPS = (RULES[:4], RULES[4:7], RULES[7:12], RULES[12:])
 
 

@@ -42,8 +42,8 @@ from pipeline.temperature.plant import strictly_proper
 from pipeline.temperature.test_set import panel, scorecard
 from pipeline.temperature.tracking import robust_observer_gain
 
-NEWEST = 0.25  # of a single recording: its end stands for the machine as it is today
-SHORTEST = 100  # samples of a piece between two missing ones, below which it shows nothing of its own
+NEWEST = 0.25  # fraction at the end of a single recording that represents the machine as it is today
+SHORTEST = 100  # least samples of a piece between two missing ones
 REACH = 0.25  # of the recorded span, beyond which no reference is certified
 COOLEST = 0.05  # quantile of the recorded temperatures
 
@@ -174,8 +174,8 @@ def _draft(exported: Exported, record: EvidenceRecord) -> Certificate:
 
 # ---- is the record of this machine?
 
-LAGS = 5  # of errors and inputs from which a coloured error could have been foretold
-# share of the largest command that is allowed: a record that never leaves it is in another unit (0..1)
+LAGS = 5  # of errors and inputs from which a coloured error could have been predicted
+# fraction of the largest allowed command; a record that never exceeds it is in another unit (0..1)
 SCALE = 0.015
 
 
@@ -512,7 +512,7 @@ def _unexplained(model: Plant, own: bands.Predictors, u: Segments, y: Segments, 
         errors = [b - _bounded(predicted_ahead(plant, a, b, ahead)) for plant in (model, of_own)]
         moved = b[ahead:] - b[:-ahead]
         for k, part in enumerate((errors[0][first:], errors[1][first:], moved[first - ahead :])):
-            # about the mean: another room is not another plant
+            # about the mean: another room temperature is not another plant
             squares[k] += len(part) * part.var(axis=0)
         count += len(b) - first
     by_model, by_own, moved = squares / count

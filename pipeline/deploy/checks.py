@@ -15,7 +15,7 @@ from pipeline.deploy.supervise import DEGC, PERCENT, Exported, Supervised
 from pipeline.temperature.controllers.law import RunningController, all_fed_forward
 from pipeline.temperature.test_set import panel
 
-SAME = 1e-9  # of an input's range, by which commands in another order of sums may differ
+SAME = 1e-9  # of an input's range: allowed difference if sums are computed in another order
 COMPILERS = ("cc", "gcc", "clang")
 
 
@@ -101,7 +101,7 @@ def check_compiled(made: Exported, files: Mapping[str, str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name, text in files.items():
             (Path(folder) / name).write_text(text, encoding="utf-8")
-        # without -Werror: a warning of some compiler is no fault of the controller
+        # without -Werror: a compiler's warning is no fault of the controller
         command = ["make", "-s", "test", f"CC={compiler}", "STRICT=-std=c99", "CFLAGS=-O0"]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
     if done.returncode:

@@ -28,7 +28,7 @@ from pipeline.temperature.controllers.law import Plant
 
 VERSION = 1
 CONTROLLER, ARRAYS, CERTIFICATE = "controller.json", "arrays.safetensors", "certificate.json"
-EXPORTED = "exported.json"  # beside the folders of the loops: what there is, and why not
+EXPORTED = "exported.json"  # beside the folders of the loops: what was exported, and if not, why
 
 
 def plants_sha256(plants: Sequence[Plant]) -> str:

@@ -142,7 +142,7 @@ def _wished(
     return wished
 
 
-WARM_UP = 3000  # samples after which what a governor at its own pace remembers has faded to 3e-7
+WARM_UP = 3000  # samples after which the memory of a governor at its usual pace has faded to 3e-7
 SIDE_BY_SIDE = 400  # chunks of a long recording
 
 
@@ -157,7 +157,7 @@ def _governed(
     at = np.maximum(first - warm, 0)
     memory, asked = started(family, log.y[at]), u.copy()
     for step in range(warm + length):
-        # chunks near the beginning have less before them, and wait
+        # chunks near the beginning have fewer samples before them, and wait
         now = first - warm + step
         mine = np.flatnonzero((now >= 0) & (now < T))
         rows = now[mine]

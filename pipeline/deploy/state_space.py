@@ -28,7 +28,7 @@ def systems(exported: Exported) -> dict[str, control.StateSpace]:
         u = F r - K z - D y - K_r xi,          F r holds y at r
     """
     machine, law, model = exported.machine, exported.controller.law, strictly_proper(exported.model)
-    # python-control takes what follows a dot for a signal of another system
+    # python-control reads the part after a dot as a signal of another system
     u, y = ([one.name.replace(".", "_") for one in side] for side in (machine.inputs, machine.outputs))
     r, T = [f"{name}_reference" for name in y], machine.sample_time_s
     p, q = len(y), len(law.A)

@@ -44,16 +44,16 @@ from pipeline.temperature.test_set import panel
 
 TEMPERATURE, COMMAND, FORECAST = 1, 2, 4
 BEYOND = 0.1  # of a range: signals may leave it by so much
-NEARLY_ALL = 0.99  # of the forecasts on honest plants are no further off
-HONEST = 0.96  # of honest logs keep every limit
-LEAST_SHARE = 0.05  # of a log, beyond whose ranges it is off
-LEAST_FIGURES = (0.05, 1.5, 1.0)  # below which no log is off, whatever the honest ones were
+NEARLY_ALL = 0.99  # fraction of the forecasts on honest plants within the limit
+HONEST = 0.96  # fraction of honest logs that keep every limit
+LEAST_SHARE = 0.05  # fraction of a log outside the ranges, above which the log is off support
+LEAST_FIGURES = (0.05, 1.5, 1.0)  # least limits of figures, whatever the honest logs show
 FEW, FEW_LOGS = 1.5, 30
 ENOUGH = 100
-STILL = 3.0  # of `rest`, within which outputs stay, and would by their inputs, where nothing moves
+STILL = 3.0  # times `rest`: if outputs, measured and computed from inputs, vary less, nothing moves
 TAU, DRIFT, LEAK, UNHURRIED = 0.2, 0.06, 1e-4, 16  # of the observers, as of the governor's
-AT_ONCE = 4  # forecasts begin so often within the steps that one goes
-MOST_SAMPLES = 60_000  # of a long log forecasts are judged in stretches, so many samples in all
+AT_ONCE = 4  # forecasts that run at the same time
+MOST_SAMPLES = 60_000  # longer logs are judged in stretches with this many samples in total
 STRETCH = 2_000
 BLOCK = 1 << 17  # samples whose states are held at once, of all plants
 
@@ -108,7 +108,7 @@ def distances(run: FamilyForecasts, noise: np.ndarray) -> np.ndarray:
     return np.sqrt(np.einsum("ai,ai->a", run.miss, whitened))
 
 
-NOISES = 2.0  # deviations: of the sample that is forecast, and of those from which
+NOISES = 2.0  # factor on the noise: that of the forecast sample, and of those from which it is forecast
 
 
 def fit_mixture(run: FamilyForecasts, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -33,9 +33,10 @@ TEMPLATES = Path(__file__).with_name("templates")
 PARTS = ("law.h", "law.c", "supervisor.h", "supervisor.c")
 COPIED = ("test_controller.c", "Makefile")
 WIDTH = 110
-# the governor's bound of rounding errors in °C: a forecast of 250 °C in single precision is sure to 3e-5
+# the governor's bound of rounding errors in °C: a forecast of 250 °C in single precision is accurate to 3e-5
 SINGLE_EXACT = "BY_PRECISION({}, 3e-5)"
-# of several columns least_squares takes at most INPUTS, which gcc does not see: of one it warns of a second
+# least_squares takes at most INPUTS columns; gcc does not see this, and with one input it warns of a second
+# column
 ONE_INPUT = '#if defined(__GNUC__)\n#pragma GCC diagnostic ignored "-Warray-bounds"\n#endif\n\n'
 
 

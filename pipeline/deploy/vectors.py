@@ -20,12 +20,12 @@ from pipeline.temperature.plant import hold_output, strictly_proper
 
 # what is done at a sample: in manual; a step; before it hand over, restore, or acknowledge; begin anew
 WATCH, STEP, HAND_OVER, RESTORE, ACKNOWLEDGE, BEGIN = range(6)
-# readings that are none of the plant's: no number at all, and the one before once more
+# readings that do not come from the plant: no number, and the previous reading once more
 LOST, REPEATED = np.inf, -np.inf
 TOLERANCE = 1e-9  # of each input's range
-# largest share of an input's range by which readings moved by UNSURE may move an input: a law's own gains
+# largest change of an input, as a fraction of its range, if readings change by UNSURE: from a law's own gains
 OWN_GAINS = 1e-6
-UNSURE = 1e-9  # degC: what no reading is known to, and more than rounding of any forecast
+UNSURE = 1e-9  # degC: smaller than the accuracy of any reading, larger than the rounding of any forecast
 
 
 class Script(NamedTuple):

@@ -14,8 +14,8 @@ import scipy.stats
 from pipeline.nightly import drift
 from pipeline.nightly.drift import Changes, DriftCause, DriftRecord, ProductionModel, Scatter, Segments
 
-OWN = 0.05  # share of its errors that a cause must explain of the champion's own records, to be taken up
-VERSION, BEFORE = 3, 2  # of reference.json; that before it is read too
+OWN = 0.05  # fraction of the errors on the champion's own records that a cause must explain to be included
+VERSION, BEFORE = 3, 2  # of reference.json; the previous version is read too
 # the changes of a machine as version 2 named them, each a list by channel
 KINDS_BEFORE = {
     "gain": "gain", "rate": "time constant", "delay": "delay", "cap": "saturation", "offset": "offset",
@@ -92,8 +92,8 @@ def measured(
     models = without or [machine] * len(nights)
     scale = _scale(models, nights, loose, changes, floors)
     records = [rested(model, night, scale, changes) for model, night in zip(models, nights, strict=True)]
-    # a new night is held against the champion's own model: what that one gets wrong of its own nights, and
-    # those without them do not, is no change of the machine either
+    # a new night is compared with the champion's own model, so its errors on its own nights, which the models
+    # without them do not have, are no change of the machine either
     held = [*records, *(rested(machine, night, scale, changes) for night in (nights if without else []))]
     estimates = np.array([[fit[1:] for fit in drift.alone(one, changes)] for one in held])
     noises = [noise(drift.by_output(one, drift.left(one, changes))) for one in records]

@@ -9,9 +9,9 @@ import numpy as np
 from pipeline.nightly.drift import Shift, shift
 
 FIGURES = ("row_px", "tilt_px", "background", "contrast", "sharpness_per_px", "width_px")
-VISIBLE = 12.0  # gray levels by which a bead must stand out of its background to be looked at
-# background and contrast that change by shares within this ratio of each other changed together: the light,
-# not the ink
+VISIBLE = 12.0  # gray levels by which a bead must stand out of its background to be measured
+# if the relative changes of background and contrast are within this ratio of each other, the light has
+# changed, not the ink
 ALIKE = 0.5
 
 
@@ -200,7 +200,7 @@ def class_balance(now: np.ndarray, before: np.ndarray, *, together: float) -> Sh
     usual = 100 * before / np.maximum(before.sum(axis=1, keepdims=True), 1)
 
     def deviation(percent: np.ndarray, count: np.ndarray) -> np.ndarray:
-        # half a run added to each class, so that a class that was never seen is not certain
+        # half a run is added to each class, so that a class that was never seen has no zero deviation
         p = (percent / 100 * count / together + 0.5) / (count / together + 0.5 * percent.shape[-1])
         return 100 * np.sqrt(p * (1 - p) / np.maximum(count / together, 1))
 

@@ -88,7 +88,7 @@ def hand_over(
     dvc("add", "--quiet", str(place))
     pointer = yaml.safe_load((FOLDER / f"{folder}.dvc").read_text(encoding="utf-8"))["outs"][0]
     hashes = md5s(place)
-    # what `bring` takes them from is on the disk before a commit names it
+    # the cache files from which `bring` restores are on the disk before a commit names them
     for md5 in {pointer["md5"], *hashes.values()}:
         _write_through(Path(".dvc/cache/files/md5", md5[:2], md5[2:]))
     return pointer, hashes
@@ -215,7 +215,7 @@ def stack(state: ChampionState, loop: str) -> list[tuple[int, Champion]]:
         if line.loop != loop:
             continue
         if line.event == ROLLED_BACK and at:
-            champions = champions[: at[-1] + 1]  # down to the one that was put back
+            champions = champions[: at[-1] + 1]  # up to the one that was put back
         elif line.event == DRIFT_ACCEPTED:
             champions[-1] = (champions[-1][0], line.champion)
         else:

@@ -32,29 +32,29 @@ import scipy.stats
 from pipeline.temperature.identification.refinement import Predictor, free_response, linear_recurrence
 from pipeline.temperature.plant import Plant, clip_spectral_radius
 
-BLOCKS = 12  # into which a record is cut for the variance of an estimate
-SHORTEST = 96  # samples of a record that is asked
+BLOCKS = 12  # blocks of a record, for the variance of an estimate
+SHORTEST = 96  # samples that a record must have
 COURSE = 8  # degree of the polynomial that the air around may follow within a segment
-# by kind of cause: the step of a derivative, and the ends between which it is looked for; a delay that is
-# longer is a mistake of the record
+# by kind of cause: the step of a derivative, and the range of the search; a delay that is longer is a
+# recording mistake
 RANGES = {
     "gain": (0.02, -0.98, 1.0), "time constant": (0.02, -0.6, 1.5), "offset": (0.1, -60.0, 60.0),
     "delay": (1.0, -16.0, 64.0), "late sensor": (1.0, -16.0, 64.0),
 }  # fmt: skip
-GUESSES = dict.fromkeys(("delay", "late sensor"), (6.0, 20.0, 40.0))  # where the search may begin, beside 0
-ENOUGH = 0.01  # of the squared error: steps that win less are not taken
-SURE = 5.0  # a cause is named from so many sigmas on, squared: what it explains beyond the noise
-# of what the first cause explains, a second one must explain so much: less is what the model gets wrong of it
+GUESSES = dict.fromkeys(("delay", "late sensor"), (6.0, 20.0, 40.0))  # starts of the search, besides 0
+ENOUGH = 0.01  # reduction of the squared error below which a step is not taken
+SURE = 5.0  # sigmas from which a cause is named; squared, the least that it must explain
+# a second cause must explain this fraction of what the first explains; less may be model error of the first
 REMAINDER = 0.004
 RIVALS = 4.0  # a rival that explains less by up to this (two sigmas squared) is named too
-# by so much more than the champion's own errors must draughts explain a record: they also cover what changed
+# draughts must explain a record better by this much, because they can also hide a change of the machine
 DRAUGHTY = 30.0
 CALM = 0.2  # °C of the course of the air in a closed room
 SEASON = 20.0  # °C by which another season's air may differ
-UNLIKE = 0.1  # share of the air's course by which one output may follow it otherwise than the others
-CAUSE = 10.0  # by so much more must a cause explain than another season's air
+UNLIKE = 0.1  # fraction of the air's course by which one output may follow it differently from the others
+CAUSE = 10.0  # by this much more must a cause explain than another season's air
 MOST = 3  # causes of one record
-LOST = 0.04  # share of what is asked of a heater: if its cap takes less, nobody needs to know
+LOST = 0.04  # fraction of a heater's command: if its cap removes less, it does not matter
 
 Segments = Sequence[tuple[np.ndarray, np.ndarray]]
 
@@ -67,8 +67,8 @@ class DriftCause(NamedTuple):
     channel: int
 
 
-# of a machine against the model, one after the other: a share of a gain or of a rate (the inverse of a time
-# constant), samples of a delay or of a late sensor, the most that acts of an input, °C of an offset
+# changes of a machine from the model, one after the other: fraction of a gain or of a rate (the inverse of a
+# time constant), samples of a delay or of a late sensor, the largest effective input, °C of an offset
 Changes = tuple[tuple[DriftCause, float], ...]
 
 
@@ -525,7 +525,7 @@ def explain(record: DriftRecord, changes: Changes, usual: Mapping[DriftCause, fl
             else -np.inf
             for fit in fits
         ])  # fmt: skip
-        # transport is commoner than a late sensor, which is named if it explains more
+        # a transport delay is commoner than a late sensor, so a late sensor must explain more to be named
         behind = [RIVALS * _colour(fit) if fit.cause.kind == "late sensor" else 0.0 for fit in fits]
         best = int((worth - behind).argmax())
         if not np.isfinite(worth[best]):

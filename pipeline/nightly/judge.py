@@ -28,7 +28,7 @@ from stages.ingest import Ingest, recording_wish
 from stages.tune_weights import read_models
 
 MEMO = Path("datasets/memo/panel")
-PAGE = "page"  # of nightly.holdout.controller: the contestant that the page names
+PAGE = "page"  # value of nightly.holdout.controller: the controller that the page names
 
 
 class Judge(NamedTuple):
@@ -97,7 +97,7 @@ def _deposition(folder: Path) -> CaseCosts:
         )
         for k in rows
     }
-    # missing where no line is long enough, or its forecast is not judged: that is no good line
+    # NaN if no line is long enough, or if its forecast is not valid; this does not mean a good line
     lines = [float(volume) for k in rows if np.isfinite(volume := table["worst_line_volume_percent"][k])]
     guards = {"worst_line_volume_percent": max(lines)} if lines else {}
     return CaseCosts(joblib.hash(sorted(cases)), cases, guards)
@@ -151,7 +151,7 @@ class NotComparable(ValueError):
     """Raised if a controller cannot be designed from its files; the message is one sentence."""
 
 
-# besides plant.parquet and window.parquet: what some contestants are designed from
+# artifacts that some controllers are designed from, besides plant.parquet and window.parquet
 DESIGNED_FROM = {
     "printer_pid": "ingest/printer_pid.json",
     "pi_simc": "identify_plant/spread.parquet",
@@ -228,7 +228,7 @@ def _closed_loop(frozen: FrozenPanel, folder: Path, contestant: str, rule: Promo
         )
     }
     by_plant = [result.costs[asked.plant == p].mean() for p in np.unique(asked.plant)]
-    # as the page asks: stable on every plant, and the margin of the one that a tenth of them lie below
+    # as on the page: stable on every plant, and the margin that only a tenth of the plants lie below
     disk = float(np.quantile([margin.disk for margin in result.margins], 0.1, method="nearest"))
     guards = {
         "worst_case": float(np.max(by_plant)),
@@ -250,7 +250,7 @@ def judged(frozen: FrozenPanel, folder: Path, name: str) -> evaluation.Controlle
         design, setting = _designed(frozen, folder, name)
     except ValueError as reason:
         raise NotComparable(str(reason)) from None
-    # the gap to the optimum is for pages
+    # the gap to the optimum is only needed on pages
     return evaluation.evaluate(name, design._replace(plain=None), setting)[1]
 
 
@@ -275,7 +275,7 @@ def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[Design, pan
             f"{path}: expected the tuned parameters of {name}, {', '.join(values)}, found "
             f"{', '.join(tuned) or 'none'}; let tune_weights tune it"
         )
-    # what it was tuned for, not what it is judged by
+    # the conditions for which it was tuned, not those of the test
     problem = panel.design_problem(models, tracking, setting, None)._replace(
         horizon=int(tuned_for.get("horizon_steps", frozen.settings.steps)),
         noise=np.array(tuned_for.get("noise_degC", frozen.rehearsal.noise), float),
@@ -376,7 +376,7 @@ def segments(
     cuts = np.flatnonzero(np.diff(record["segment"])) + 1
     pairs = []
     for a, b in zip(np.split(u, cuts), np.split(y, cuts), strict=True):
-        # inputs without gaps: what lies between two is a segment of its own
+        # inputs without gaps: each stretch between two gaps is its own segment
         edges = np.flatnonzero(np.diff(np.concatenate([[0], np.isfinite(a).all(axis=1).astype(int), [0]])))
         pairs += [(a[i:j], b[i:j]) for i, j in zip(edges[::2], edges[1::2], strict=True) if j - i >= 30]
     return pairs

@@ -15,7 +15,7 @@ from pipeline.nightly.worktree import COPY, Snapshot
 from pipeline.store import artifacts
 
 NOTE = STATE / "landing.json"
-# on the disk before the night says so: git's default leaves loose objects in memory
+# written to the disk before the run reports it: git's default leaves loose objects in memory
 DURABLE = {"core.fsync": "all"}
 
 
@@ -144,11 +144,11 @@ def _bring_files(landing: Landing) -> list[str]:
     paths = differ(landing.before, landing.commit)
     deleted = differ("--diff-filter=D", landing.before, landing.commit)
     staged = differ("--cached", landing.before)
-    # no reference holds that commit: a clean-up of git may have taken it
+    # no reference points to that commit, so git's clean-up may have removed it
     files = git("rev-parse", "-q", "--verify", f"{landing.files}^{{commit}}", check=False) or landing.before
     edited = differ(files)
     tracked = {*names("ls-tree", "-r", "--name-only", files)}
-    # what git did not know when the night began, a new recording, lies there already
+    # a file that git did not know when the run began, such as a new recording, is already there
     bring = [name for name in paths if name not in edited and (name in tracked or not Path(name).exists())]
     for name in {*bring} & {*deleted}:
         Path(name).unlink(missing_ok=True)

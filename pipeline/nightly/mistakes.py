@@ -18,14 +18,15 @@ from pipeline.nightly.baseline import Baseline
 from pipeline.nightly.drift import ProductionModel, Segments
 
 BETTER = 30.0  # by which the mean squared error must fall
-HONEST = 2.0  # of the largest of the champion's own records: what an honest one may leave
-AS_MUCH = 2.0  # a change of the machine that leaves up to so much more explains as much
+HONEST = 2.0  # times the largest error of the champion's own records that an honest record may leave
+AS_MUCH = 2.0  # a change of the machine that leaves up to this many times the error explains as much
 ROOM = drift.RESTLESS._replace(another_season=False)  # the air is not 48 °C warmer: that is °F
-# what is left with two mistakes undone that a record does not tell apart: one sensor, or every one
+# ratio of the remaining errors up to which a record cannot distinguish two mistakes, such as one sensor or
+# every one
 ALIKE = 2.0
-# samples by which a clock is looked for, before those between
+# clock shifts in samples that are tried first, before those between them
 CLOCKS = [late for far in (2, *range(4, 129, 4)) for late in (far, -far)]
-# what is written, and the factor and the offset that undo it
+# what was written, and the factor and the offset that undo it
 OF_SENSORS = (
     ("in °F where °C is declared", 1 / 1.8, -32 / 1.8),
     ("in K where °C is declared", 1.0, -273.15),
@@ -75,7 +76,7 @@ def found(
     if mistake.left > honest(own) or mistake.better < BETTER:
         return None
     samples = sum(int(one.measured.sum()) for one in asked.segments)
-    every_delay = drift.DriftCause("delay", -1)  # which is a shifted clock by another name
+    every_delay = drift.DriftCause("delay", -1)  # this is the same as a shifted clock
     explained = [fit.explained for fit in drift.alone(asked, own.changes) if fit.cause != every_delay]
     return None if as_is - max(explained) / samples < AS_MUCH * mistake.left else mistake
 

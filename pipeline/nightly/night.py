@@ -33,7 +33,7 @@ from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.nightly.worktree import COPY, Snapshot
 from pipeline.store import artifacts, params
 
-# the loop whose recordings are learned from if this parameter says so
+# loop -> the parameter that decides whether its recordings are used for learning
 RECORDED = "recordings"
 SOURCES = {
     "temperature": "generate_probing.source",
@@ -52,7 +52,7 @@ def nightly(render: reporting.Render, now: datetime.datetime | None = None) -> t
             return _run(started, render)
     except worktree.BusyError as busy:
         return reporting.BUSY, f"nightly: refused: {busy}"
-    except Exception as error:  # nothing may end a night without a word
+    except Exception as error:  # no run may end without a report
         return reporting.last_resort(error, started)
 
 
@@ -84,21 +84,21 @@ def _run(now: datetime.datetime, render: reporting.Render) -> tuple[int, str]:
     try:
         try:
             settings = params.load(Nightly, "nightly")
-        finally:  # what a killed night left is put right whatever the parameters are
+        finally:  # repairs what a killed run left, whatever the parameters are
             night.notes += [*worktree.clear_killed(), *landing.finish(), *champion.follow()]
         _work(settings, last, memory, night)
-    except Exception as error:  # refused in a sentence, or a mistake of this program
+    except Exception as error:  # a refusal in a sentence, or an error of this program
         night.notes += _fail(night, reporting.tell(error, night.run))
-    worktree.remove()  # on a full disk, what follows needs the room
+    worktree.remove()  # on a full disk, the following steps need the space
     night.seconds = round(time.monotonic() - clock, 1)
     if last.success and settings and (overdue := watch.find_overdue(now, last.success, settings.watch_h)):
         night.notes.append(f"watch: {overdue}")
     if night.outcome == records.FAILED:
-        # a recording of a failed night is new again the next one, and must not count as two
+        # a recording of a failed run is new again in the next one, and must not count twice
         last.hashes, memory = memory.hashes, last
     else:
         memory.unpushed, memory.idle = night.unpushed, night.idle
-        # a night that lost a loop is repeated
+        # a run that lost a loop is repeated
         memory.inputs, memory.success = ("", last.success) if night.lost else (memory.inputs, night.when)
     memory.night = number
     return reporting.report(night, memory, settings, render)
@@ -145,7 +145,7 @@ def _work(settings: Nightly, last: Memory, memory: Memory, night: Night) -> None
         digests = inputs.contents(places, memory.hashes)
     recordings = {name: inputs.recordings(digests, loop) for name, loop in settings.loops.items()}
     memory.recordings, memory.inputs = last.recordings | recordings, inputs.digest(digests)
-    # what was set aside in the copy is to be moved out of the project too
+    # recordings that were set aside in the copy must be moved out of the project, too
     moved = [path for path in night.drift.quarantined if Path(path).exists() and not (COPY / path).exists()]
     aside = {path: artifacts.sha256(path) for path in moved}
     if is_known():
@@ -274,7 +274,7 @@ def _learn(
     """Runs the stages in the copy, and judges the results."""
     from pipeline.nightly import promoting
 
-    # the pages of tonight show tonight's drift, and judge by it
+    # the pages of this run show its drift, and use it in their verdicts
     artifacts.write_json(METRICS, night.metrics(state))
     for loop in settings.loops.values():
         # large recordings are DVC's: the pointer beside the folder moves with it

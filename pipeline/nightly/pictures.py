@@ -124,7 +124,7 @@ def of_prints(folder: Path, champion: Path, most: int, only: Sequence[str] = ())
     for number, name in numbered[-most:]:
         here = frames.print_number == number
         seen = here & frames.valid & (frames.label >= 0)
-        if not seen.any() and (here & frames.valid).any():  # its flow is not known
+        if not seen.any() and (here & frames.valid).any():  # the print's flow is unknown
             continue
         classes = np.bincount(frames.label[seen], minlength=3).tolist()
         together = float(here.sum() / len(np.unique(frames.segment[here])))
@@ -189,7 +189,7 @@ def find_prints_drift(
     names = {one.name for one in before}
     try:
         prints = [one for one in of_prints(Path(folder), champion, 10**6) if one.name not in names]
-    except ValueError as error:  # what the stage will refuse as well, and say so
+    except ValueError as error:  # the stage will refuse this as well, and report it
         drift.notes.append(str(error))
         return
     for one in prints:

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 STATE = Path(".beadline")
-# DVC for the night whose number its first argument is. If the night is killed, the kernel says so, if it can
-# (PR_SET_PDEATHSIG of prctl), and DVC ends with its stages, which are of its process group. The stages do not
-# hear of it themselves
+# runs DVC for the nightly run whose process id is its first argument. If that run is killed, the kernel
+# signals it, if it can (PR_SET_PDEATHSIG of prctl), and DVC ends together with its stages, which are in its
+# process group. The stages themselves get no such signal
 DVC = """
 import ctypes, os, runpy, signal, sys
 signal.signal(signal.SIGTERM, lambda *_: os.killpg(0, signal.SIGKILL))
@@ -41,8 +41,8 @@ def git(
         check=False,
         capture_output=True,
         encoding="utf-8",
-        errors="surrogateescape",  # as Python names files whose names are no text
-        # a recording may be called [1].csv, which git would take for a pattern
+        errors="surrogateescape",  # as Python represents file names that are no text
+        # a recording may be called [1].csv, which git would read as a pattern
         env={**os.environ, "GIT_LITERAL_PATHSPECS": "1", **(env or {})},
         input=text,
     )
@@ -110,7 +110,7 @@ def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> None
             os.killpg(child.pid, signal.SIGKILL)
             child.wait()
     if status:
-        # on a full disk the log is cut off, and says nothing
+        # on a full disk the log is incomplete and gives no reason
         free_mb = shutil.disk_usage(Path()).free / 1e6
         full = f"; no space left on device ({free_mb:.1f} MB); free some" if free_mb < FULL_MB else ""
         text = target.read_text(encoding="utf-8", errors="replace")

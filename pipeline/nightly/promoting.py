@@ -32,9 +32,9 @@ from pipeline.verdict.verdict import PASSED, Verdict
 
 STORED = "datasets/verdict"
 REPORT = "datasets/report/figures.json"
-# artifacts that only some contestants are designed from, and that a record may not determine
+# artifacts that only some controllers are designed from, and that a record may not determine
 OPTIONAL = {f"datasets/{path}" for path in judge.DESIGNED_FROM.values()}
-# the certified controller of the temperature loop, installed beside what it was designed from
+# the certified controller of the temperature loop, stored beside the artifacts that it was designed from
 CERTIFYING, EXPORTED = "export_controllers", "datasets/export_controllers/temperature"
 CERTIFICATE = f"{EXPORTED}/certificate.json"
 CERTIFIED = (f"{EXPORTED}/controller.json", f"{EXPORTED}/arrays.safetensors", CERTIFICATE)
@@ -50,7 +50,7 @@ def judge_all(
         verdict = by_loop.get(name)
         try:
             decision = judge_loop(settings, name, night, state, verdict)
-        except reporting.REFUSALS as error:  # what cannot be judged stops no other loop
+        except reporting.REFUSALS as error:  # a loop that cannot be judged stops no other loop
             why = " ".join(str(error).split())
             decision = LoopDecision(records.FAILED, [f"it cannot be judged, and its champion stays: {why}"])
         decision = decision._replace(verdict=verdict and verdict._replace(rules=()))
@@ -59,7 +59,7 @@ def judge_all(
         if decision.promotes or waits:
             state = _place(settings.loops[name], name, night, state, lineage)
         if name in state.candidates and not waits and verdict and verdict.state == PASSED:
-            # what did not pass before it is of no more use
+            # the earlier candidate, which did not pass, is no longer needed
             champion.remove(candidate_of(name))
             others = {loop: one for loop, one in state.candidates.items() if loop != name}
             state = state._replace(candidates=others)

@@ -44,8 +44,8 @@ def from_json(record: type[R], fields: Any) -> R:
 
 # ---- drift
 
-PLANT = "temperature"  # the loop whose recordings tell of the plant's parameters
-SENSOR = "sensor"  # kind of an alarm that stands above every other: a sensor that stands still
+PLANT = "temperature"  # the loop whose recordings show the plant's parameters
+SENSOR = "sensor"  # the most urgent kind of alarm: a sensor that stands still
 
 
 class Alarm(NamedTuple):

@@ -16,13 +16,14 @@ from pipeline.nightly.settings import Nightly
 from pipeline.store import artifacts, params
 
 OK, FAILED, DRIFTED, QUARANTINED, BUSY = 0, 1, 3, 4, 75
-# every night that is remembered, what is in production, and the settings -> the page. The caller brings it,
-# so that the night knows no page
+# returns the page from all remembered runs, the state of production, and the settings. The caller passes it
+# in, so that this package does not depend on pages
 Render = Callable[[Sequence[Night], ChampionState, Nightly], str]
 PAGE = Path("reports/nightly.html")
-# what ends a night in a sentence; anything else is a mistake of this program, whose traceback is in the log
+# errors that are reported in a sentence; any other is an error of this program, and its traceback is in the
+# log
 REFUSALS = (ValueError, OSError, MemoryError, np.linalg.LinAlgError)
-MOST_RECORDS = 3  # of which the summary says what was used
+MOST_RECORDS = 3  # recordings for which the summary says how much was used
 
 
 def tell(error: Exception, run: str) -> str:
@@ -167,7 +168,7 @@ def load_settings() -> tuple[Nightly | None, list[str]]:
     sentences."""
     try:
         return params.load(Nightly, "nightly"), []
-    except Exception as error:  # nothing in a file of parameters may keep the alarm from going out
+    except Exception as error:  # whatever is in the parameters, the alarm must be sent
         return None, [tell(error, "nightly")]
 
 
@@ -182,7 +183,7 @@ def watchdog(now: datetime.datetime | None = None) -> tuple[int, str]:
         success = remembered.read().success
         if settings:
             reasons += filter(None, [watch.find_overdue(now, success, settings.watch_h)])
-    except Exception as error:  # a watchdog that dies would be the most silent of all
+    except Exception as error:  # a watchdog that crashes would not warn anybody
         reasons.append(tell(error, "watch"))
     if not reasons:
         return OK, f"nightly: watch: the last success was at {success}"

@@ -32,7 +32,7 @@ def reproduce(
     for name in loops:
         stages = [stage for stage, several in loops_of.items() if name in several and several != {*loops}]
         try:
-            if stages:  # what is made already takes no time, and what failed says why
+            if stages:  # stages already made take no time, and a failed one gives its reason
                 dvc("repro", *stages, log=log.with_suffix(f".{name}.log"), limit_s=limit_s)
         except ValueError as error:
             lost[name] = str(error)
@@ -117,5 +117,5 @@ def _undo(stages: set[str]) -> None:
     for out in (out for name in stages for out in outs_of(wired[name])):
         git("checkout", "-q", "HEAD", "--", out, check=False)
     if known := [name for name in stages if name in before]:
-        with contextlib.suppress(ValueError):  # what is in no cache is made by the next repro
+        with contextlib.suppress(ValueError):  # outputs in no cache are made by the next repro
             dvc("checkout", "--quiet", "--force", *known)

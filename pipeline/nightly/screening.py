@@ -36,7 +36,7 @@ def look(
             pictures.find_prints_drift(
                 drift, limits, name, loop.recordings, paths, own, _read(own), memory.pending
             )
-        # what each loop recorded since its alarm: a person may accept that as how things are
+        # recordings of each loop since its alarm: a person may accept these as the new normal
         raised = [a.recording for a in drift.alarms if a.loop == name and a.kind != SENSOR]
         drifted[name] = list(dict.fromkeys([*drifted.get(name, []), *raised])) if raised else []
     drift.alarms = sort_alarms(drift.alarms)

@@ -23,13 +23,13 @@ from pipeline.temperature.settings import Plant as Machine
 
 Segments = Sequence[tuple[np.ndarray, np.ndarray]]
 KINDS = (OPEN, STILL)
-SPACINGS = (1, 4, 16)  # samples from one that is asked to the next
-GONE = 30  # samples without a number that an honest log may have, all together
-ON = 0.01  # share of a heater's range that is given by one that is on
+SPACINGS = (1, 4, 16)  # distances between tested samples
+GONE = 30  # samples without a number that an honest log may have in total
+ON = 0.01  # fraction of its range above which a heater counts as on
 LASTS = 60  # samples for which a sensor stays in doubt: one that only seems to stand still soon moves again
-SHARE = 1 / 3  # of a record, if it is not in doubt to the end: a good loop holds a coarse sensor still
-RESTLESS = 0.15  # share of samples at which a sensor turns back, whose noise is a quarter of its step or more
-MISSING = 30.0  # reversals that a sensor that turns back so often owes, before it is said to be stuck
+SHARE = 1 / 3  # of a record, unless the doubt lasts to its end: a good loop may hold a coarse sensor still
+RESTLESS = 0.15  # fraction of samples at which a sensor turns back if its noise is 1/4 of its step or more
+MISSING = 30.0  # missing reversals after which such a sensor counts as stuck
 
 
 class SensorFault(NamedTuple):
@@ -90,7 +90,7 @@ def faults(
         machine.sample_time_s,
     )
     supervision = assembly.supervision(strictly_proper(model), wired, noise)
-    # a logger may round to coarser steps from tonight on, in which a healthy sensor turns back less often
+    # the logger may now round to coarser steps, with which a healthy sensor turns back less often
     tonight = np.minimum(smallest_changes([segments], 0.0), supervise.MOST_STEP_DEGC)
     often = np.where(tonight > 2 * np.maximum(steps, noise), 0.0, reversals)
     steps = np.maximum(steps, tonight)
@@ -158,7 +158,7 @@ def _follow(
             there = k.since[list(KINDS), : len(s.d)] >= 0
             if (there & (doubtful == 0)).any():
                 before = u[max(t - spacing * WINDOWS * SPACING, 0) : t + 1, heaters]
-                # what the model does of itself, of a machine that is cold and off, says nothing
+                # moves of the model alone, with the machine cold and off, are no evidence
                 off = before.max(axis=0) - s.low[heaters] < ON * (s.high - s.low)[heaters]
                 unfounded[1:] |= (there & (doubtful == 0))[1:] & off
             unfounded &= there

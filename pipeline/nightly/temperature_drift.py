@@ -21,13 +21,14 @@ from pipeline.temperature.settings import Plant, recorded
 from pipeline.temperature.tables import set_point_of
 
 REFERENCE = "reference.json"  # in the champion's folder
-PIECES = 4  # into which a single record of the champion is cut, to stand for nights
-NIGHTS = 12  # of the champion's own recordings that a new one is held against
-# a rival so far past its limit, in units of it, is said before the likeliest cause, which is within its own
+PIECES = 4  # into which a single record of the champion is cut; each is used as one night
+NIGHTS = 12  # number of the champion's own recordings with which a new one is compared
+# a rival that is this many times its limit is named before the likeliest cause, if that one is within its
+# limit
 AHEAD = 2.0
-LONGEST = 7200  # samples of a record that are asked, its last ones
+LONGEST = 7200  # samples of a record that are used, the last ones
 POOLED = 3  # nights over which an estimate is pooled
-# several nights tell how the air around scatters from one to the next, pieces of one do not
+# several nights show how the ambient air scatters from one to the next; pieces of one night do not
 NIGHTS_FLOORS, PIECES_FLOORS = baseline.Floors(0.03, 0.25), baseline.Floors(0.2, 2.0)
 # mean offset of the champion's own nights, in units of drift.offset_degC, up to which they count as a
 # closed loop at the references
@@ -35,15 +36,15 @@ SETTLED = 5.0
 FOLDS = 4  # models that are identified without some of the champion's nights
 # no machine changes by more within a night: then the record is in doubt
 MOST_GAIN_PERCENT, MOST_OFFSET_DEGC = 80.0, 50.0
-FELL_PERCENT = -60.0  # a heater that gives so much less looks like commands that are written too large
+FELL_PERCENT = -60.0  # a heater whose gain fell by more looks like commands that are written too large
 ROOM_DEGC, COLDEST_DEGC, HOTTEST_DEGC = 20.0, -30.0, 60.0  # of the champion's nights; of any room
-UNEXPLAINED = 3.0  # by so much more than an honest record may leave, a record leaves what no cause explains
-LIKELY, WORTH_NAMING = 4.0, 1.5  # times that a record fits better with a mistake undone
+UNEXPLAINED = 3.0  # times the error allowed for an honest record, above which no cause explains the record
+LIKELY, WORTH_NAMING = 4.0, 1.5  # factors by which a record fits better once a mistake is undone
 SHORTEST = 60  # samples of a stretch at one set-point that can settle
-PARTS = 4  # of a record, whose scatter tells how well its closed-loop figures are known
+PARTS = 4  # of a record; their scatter gives the accuracy of its closed-loop figures
 
 
-# by kind of cause: its limit in nightly.drift, and what is said of it; `size` is in the unit of the limit
+# by kind of cause: its limit in nightly.drift, and its sentence; `size` is in the unit of the limit
 SENTENCES = {
     "gain": ("parameter_percent", "the gain from {name} has changed by {size:+.1f} %"),
     "time constant": (
@@ -123,7 +124,7 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
     samples = int(np.median([sum(len(u) for u, _ in night) for night in nights])) if nights else 0
     try:
         production = ProductionModel(judge.identified(folder), samples)
-        # of recordings that are named, the champion's model is not made
+        # the champion's model was not made from recordings that are named
         without = None if only else _without_each(machine, nights, samples)
         own = baseline.measured(production, nights, floors, without)
     except ValueError:
@@ -492,7 +493,7 @@ def _compare_noise(
         if abs(percent) > 0.5 * limit and abs(sigmas) >= drift.SURE:
             word = "grown" if percent > 0 else "fallen"
             words = f"the noise of {output} has {word} by {abs(percent):.0f} %"
-            # of a logarithm of a variance
+            # converted from the deviation of the logarithm of a variance
             deviation_percent = 50 * float(ratio[i] * noise.deviation[i])
             louder.append(RecordingChange("noise", output, words, percent, deviation_percent, limit))
     return figures, louder
@@ -618,7 +619,7 @@ def _compare_loop(
     }  # fmt: skip
     figures, causes = {}, []
     for key, (sentence, least, allowed) in asked.items():
-        if elsewhere and key != "offset_degC":  # other set-points take other duties
+        if elsewhere and key != "offset_degC":  # other set-points need other inputs
             continue
         moved = _shift_loop(now[key], usual[key], least)
         for k, name in enumerate(production.signals["outputs" if key == "offset_degC" else "inputs"]):
@@ -634,10 +635,10 @@ def _compare_loop(
 
 def _shift_loop(now: list[list[float]], usual: np.ndarray, least: float) -> drift.Shift:
     """Compares one figure with those of the champion's nights (nights, 2, signals)."""
-    # a figure counts as known to a sixth of what matters at best, so that
-    # nights that agree by chance make no alarm of a trifle
+    # the assumed deviation of a figure is at least a sixth of its limit, so that
+    # nights that agree by chance do not turn a small change into an alarm
     own = np.maximum([*usual[:, 1], now[1]], least / 6)
-    # a few parts of one night say little of how well a mean is known: those of all nights say it
-    # together; a short or restless night is known less well
+    # a few parts of one night give a poor estimate of a mean's deviation, so those of all nights are
+    # pooled; a short or restless night keeps its larger one
     pooled = np.maximum(np.sqrt((own**2).mean(axis=0)), own[-1])
     return drift.shift(np.array(now[0]), pooled, usual[:, 0], own[:-1], freedom=(PARTS - 1) * len(own))

@@ -25,7 +25,7 @@ from pipeline.nightly.settings import Nightly
 from pipeline.store import artifacts, params
 
 ALARM = STATE / "alarm.json"
-# a try at a server, the pause before the second, and the alarm's command: all that waking may take is bounded
+# time limits: one request to a server, the pause before the second, and the alarm's command
 ASKED_S, PAUSE_S, COMMAND_S = 20.0, 2.0, 60.0
 
 
@@ -123,7 +123,7 @@ def wake(kind: str, reasons: Sequence[str], details: Mapping[str, Any], routes: 
     return troubles
 
 
-# signs that are markup in Slack or Mattermost, and others that look like them and are none
+# characters that are markup in Slack or Mattermost, and replacements that look alike and are none
 PLAIN = {"&": "&amp;", "<": "&lt;", ">": "&gt;", "*": "\u2217", "`": "\u02cb", "~": "\u223c", "@": "@\u200b"}
 
 
@@ -184,12 +184,12 @@ def _try(url: str, body: bytes | None) -> str:
             headers = {"User-Agent": "beadline"} | ({"Content-Type": "application/json"} if body else {})
             request = urllib.request.Request(url, body, headers)
             if request.type not in ("http", "https"):
-                raise ValueError(request.type)  # a file of this machine wakes nobody
+                raise ValueError(request.type)  # a file: URL notifies nobody
             with urllib.request.urlopen(request, timeout=ASKED_S) as answer:
-                # on the way to another URL the alarm is lost
+                # on a redirect to another URL the alarm's body is lost
                 sent_on = body is not None and answer.url != request.full_url
             troubles[:] = ["it sends on to another URL; write that one"] if sent_on else []
-        except Exception as error:  # whatever it is, it must not hide the night, nor tell the URL
+        except Exception as error:  # no error may hide the run, or reveal the URL
             troubles[:] = [_refusal(error)]
 
     thread = threading.Thread(target=ask, daemon=True)

@@ -18,9 +18,9 @@ from pipeline.store import artifacts
 
 LOCK, COPY, OLD = STATE / "lock", STATE / "copy", STATE / "copy.old"
 LINKED = ("datasets/raw", "datasets/holdout")
-# a younger recording may still grow: it is copied as it is, and the next night finds it changed
+# a younger recording may still grow: it is copied as it is, and the next run finds it changed
 YOUNG_S = 600.0
-LOCKED_S = 10  # a git that works in the project is waited for so long
+LOCKED_S = 10  # how long to wait for a git that is running in the project
 
 
 class BusyError(ValueError):
@@ -111,16 +111,16 @@ def make(snapshot: Snapshot, sources: Sequence[str]) -> None:
     memo.mkdir(parents=True, exist_ok=True)
     (COPY / memo).parent.mkdir(exist_ok=True)
     (COPY / memo).symlink_to(memo.resolve())
-    with contextlib.chdir(COPY), contextlib.suppress(ValueError):  # what no cache has is made anew
+    with contextlib.chdir(COPY), contextlib.suppress(ValueError):  # outputs in no cache are made again
         checkout([*read_stages("dvc.lock")], *map(str, Path("champion").glob("*.dvc")))
 
 
 def make_bare(snapshot: Snapshot) -> None:
     """Makes the copy with only the files that git has, and DVC's settings."""
     remove()
-    # hooks, as DVC's own, are of the checkout and not of the copy
+    # hooks, such as DVC's own, are for the checkout and not for the copy
     quiet = configure({"core.hooksPath": "/dev/null"})
-    # twice: also over one that was killed while git made it
+    # twice: also replaces a copy that was killed while git made it
     twice = ("--force", "--force")
     git("worktree", "add", "--quiet", "--detach", *twice, str(COPY), snapshot.files, env=quiet)
     _share_dvc()
@@ -149,7 +149,8 @@ def _share_dvc() -> None:
     with Config(dvc_dir=str((COPY / ".dvc").resolve())).edit("local") as settings:
         settings["cache"] = cache
         settings["remote"] = {name: dict(remote) for name, remote in shared["remote"].items()}
-    # by its age DVC names the folder in which it keeps what it has hashed: the same every night
+    # DVC names its folder of known hashes after the age of this file, so the age must be the same in every
+    # run
     btime = COPY / ".dvc/tmp/btime"
     btime.parent.mkdir(exist_ok=True)
     btime.touch()
@@ -183,7 +184,7 @@ def remove() -> None:
     shutil.rmtree(OLD, ignore_errors=True)
     if COPY.is_symlink():
         COPY.unlink()
-    with contextlib.suppress(OSError):  # there is none, or no room: then it goes where it is
+    with contextlib.suppress(OSError):  # no copy, or no space: then it is removed in place
         COPY.rename(OLD)
     for place in (OLD, COPY):
         shutil.rmtree(place, ignore_errors=True)

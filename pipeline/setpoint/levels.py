@@ -15,15 +15,15 @@ import numpy as np
 from pipeline.setpoint.simulation.recorded import WindowTable
 from pipeline.setpoint.vision.window_flow import class_probabilities
 
-# fewer windows say nothing of a level, fewer levels nothing of a curve
+# least number of levels for a curve, and of windows for a level
 LEAST_LEVELS, LEAST_WINDOWS = 3, 5
-# a camera sees flow where log flow shown rises by so much for each of log flow, at least, and where the
-# levels at the ends lie so many spreads apart
+# a camera sees flow if log flow shown rises at least this much per unit of log flow, and if the first and
+# last level lie at least this many spreads apart
 LEAST_SLOPE, LEAST_APART = 0.2, 3.0
-# a level may lie below the one before by so many of its standard errors, and this of log flow
+# a level may lie below the one before by this many of its standard errors plus this much log flow
 DIPS, DIP = 2.0, 0.02
-# relative width that a segment adds to its beads, one deviation, before any level has shown it; and for how
-# many levels that counts
+# assumed deviation of the relative bead width between segments, before any level is known; and the number of
+# levels that this assumption weighs
 SEGMENT_STD, SEGMENT_LEVELS = 0.05, 3
 
 
@@ -65,11 +65,12 @@ def fit(windows: LevelWindows) -> Levels:
     at, value = (_line if straight else _pieces)(y, x)
     slope = float(np.polyfit(y, x, 1)[0])
     levels = Levels(at, value, slope, 0.0, bool(straight))
-    # what a level misses a line by is its segment's doing; pieces meet each level, and show nothing of it
+    # a level's distance from a line is the effect of its segment; pieces go through each level and do not
+    # show it
     free = len(x) - 2 if straight else 0
     missed = float((np.log(corrected(levels, 100 * np.exp(y)) / flows) ** 2).sum()) if straight else 0.0
     segment = (missed + SEGMENT_LEVELS * (SEGMENT_STD * slope) ** 2) / (free + SEGMENT_LEVELS)
-    # of the next segment, and of those that the correction was fitted on
+    # variance of the next segment, and of those that the correction was fitted to
     own = segment * (1 + (2 / len(x) if straight else 1.0))
     return levels._replace(spread=float(np.sqrt((within * slope) ** 2 + own)))
 
@@ -136,7 +137,7 @@ def _summaries(windows: LevelWindows) -> tuple[np.ndarray, np.ndarray, np.ndarra
         )
     logs = [np.log(windows.seen[number & (windows.flow == flow)] / 100) for flow in flows]
     middle = np.array([np.median(values) for values in logs])
-    # 1.4826: of a normal law, deviation by median distance; half of a level's windows may be mistaken
+    # 1.4826: deviation over median distance of a normal law; up to half of a level's windows may be wrong
     deviation = np.array(
         [1.4826 * np.median(np.abs(values - m)) for values, m in zip(logs, middle, strict=True)]
     )

@@ -79,5 +79,5 @@ def _carried(x: np.ndarray, knots: np.ndarray, to: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(x), between + below + above, x) if (knots != to).any() else x
 
 
-# as Li and Pattinson 2025 printed it; 20 and 310 %, 180 and 240 °C are the edges of the published figures
+# the material of Li and Pattinson 2025; 20 and 310 %, 180 and 240 °C are the edges of the published figures
 PLA = PrintedMaterial(BEST_TEMPERATURE, (180.0, 240.0), (90.0, 110.0), (20.0, 310.0))

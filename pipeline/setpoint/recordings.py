@@ -21,7 +21,7 @@ from pipeline.store.tables import FLOAT, NONE, TEXT, Column, Schema, bytes_of
 
 MEMO = Path("datasets/memo/train_classifier")
 HERE = Path(__file__).parents[1]
-# the code that decides what an entry of the memo holds
+# the code that determines the content of a cache entry
 CODE = (
     "setpoint/recordings.py", "setpoint/frames/front_end.py", "setpoint/frames/key_area.py",
     "setpoint/frames/travel.py", "setpoint/frames/familiar.py", "recordings/images.py",

@@ -9,7 +9,7 @@ from pipeline.store.params import Mapped, Section
 if TYPE_CHECKING:
     from pipeline.setpoint.material import PrintedMaterial
 
-# as far as pixels.py looks for the nozzle's tip, in px: a number of its own, since that module imports much
+# how far pixels.py searches for the nozzle's tip, in px; repeated here, since that module imports much
 REACH_PX = 30
 
 

@@ -46,13 +46,13 @@ from pipeline.setpoint.simulation.simulator import (
 )
 
 ACTIONS = 5  # of each head
-# rows that one product sums: the linear algebra under XLA cuts longer sums by the size of the CPU's first
-# cache (288 numbers in 32 kB)
+# rows in one matrix product: the linear algebra under XLA splits longer sums by the size of the CPU's first
+# cache (288 numbers in 32 kB), so that results would differ between CPUs
 SHORT = 256
 VALIDATION_RUNS = 20  # from each of the 21 starts, to choose a checkpoint by
-RUNS, JUDGED_SEED = 100, 1000  # from each of them, to judge an agent by; and the seed of those runs' chances
-CHECKPOINTS = 16  # of a phase: the network after each of so many equal parts
-TEMPERATURE_SCALE = 30.0  # °C, half the range of the targets: degrees as they come drown the camera's numbers
+RUNS, JUDGED_SEED = 100, 1000  # test runs from each of them; and the seed of their random numbers
+CHECKPOINTS = 16  # equal parts of a phase; the network is kept after each
+TEMPERATURE_SCALE = 30.0  # °C, half the range of the targets: unscaled, they would dominate the camera inputs
 
 
 class QNetwork(eqx.Module):
@@ -75,8 +75,8 @@ class QNetwork(eqx.Module):
     def __call__(self, state: jax.Array) -> jax.Array:
         """Returns Q (2, 5) of the flow's and the temperature's actions. `state` (history + 5,): eq. 9, with
         temperatures already scaled."""
-        # both first layers as one product, zeros where one does not see the other's numbers: for a batch that
-        # is dearer in sums and cheaper in moving them
+        # both first layers as one product, with zeros between them: for a batch this needs more arithmetic
+        # but less memory traffic
         both = jax.scipy.linalg.block_diag(self.vision.weight, self.temperature.weight)
         hidden = jax.nn.relu(both @ state + jnp.concatenate([self.vision.bias, self.temperature.bias]))
         return self.heads(jax.nn.relu(self.joint(hidden))).reshape(2, ACTIONS)
@@ -108,7 +108,7 @@ def paper_encoder(history: int = HISTORY) -> ObservationEncoder:
     return ObservationEncoder(Partial(first_history, history), Partial(encode))
 
 
-@cache  # one controller for all networks, so that what was compiled for it is found again
+@cache  # one controller for all networks, so that its compiled program is used again
 def greedy(encoder: ObservationEncoder) -> SetpointController:
     """Returns the controller that takes the best action of each head; its parameters are the network. The
     simulator applies the temperature's action at every 10th step only."""
@@ -219,7 +219,7 @@ def _stepped(problem: DqnProblem, network, episodes, epsilon, u: jax.Array, key)
     action = jnp.where(explores, at_random, jax.vmap(network)(x).argmax(axis=2))
     action = action.at[:, 1].set(
         jnp.where(state.step % LAMBDA == 0, action[:, 1], STAND)
-    )  # what is not heeded is standing
+    )  # an action that is not applied is recorded as no move
     state, observation = jax.vmap(Partial(stepped, env.windows))(
         conditions, state, Action(action[:, 0], action[:, 1]), befalls
     )
@@ -305,8 +305,8 @@ def _phase(train_state: DqnState, key, problem: DqnProblem, updates, epsilon, *,
     n, capacity = settings.environments, settings.capacity
     conditions, state, memory, x = _fresh(problem, train_state.network, jax.random.split(k_start, n))
     state = state._replace(step=LAMBDA * jax.random.randint(k_clock, (n,), 0, settings.episode // LAMBDA))
-    # a step draws some thousand numbers: by XLA's own generator
-    # (Philox), which costs a tenth of jax's default there
+    # a step draws some thousand random numbers, so XLA's own generator
+    # (Philox) is used, which costs a tenth of jax's default here
     fast = jax.random.wrap_key_data(jnp.tile(jax.random.key_data(key), 2), impl="rbg")
 
     def one(i, carry):
@@ -399,7 +399,7 @@ def begin_published(key: jax.Array, settings: PublishedTraining) -> tuple[DqnSta
     return DqnState(network, network, moments), key
 
 
-@cache  # one for phases alike, so that what was compiled for them is found again
+@cache  # one for equal phases, so that their compiled program is used again
 def _adam(
     rate: float, at_end: float = 1.0, updates: int = 1, before: int = 0
 ) -> optax.GradientTransformation:

@@ -12,7 +12,7 @@ from pipeline.setpoint.agents.agent import JUDGED_SEED, RUNS, run_starts
 from pipeline.setpoint.agents.score import judge
 from pipeline.setpoint.simulation.simulator import Trajectory, nominal, paper_windows, rollout
 
-# decisions of a run from a single start, and those at its end over which it has come to rest
+# decisions of a run from a single start, and the last ones, over which the resting flow is averaged
 SHOWN, RESTING = 100, 20
 
 

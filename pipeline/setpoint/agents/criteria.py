@@ -6,11 +6,11 @@ SETTLED_BY, DWELL_UNTIL, STEPS = (
     90,
     100,
     200,
-)  # inside from some step <= 90 until 100; never out from 100 to 200 is staying
+)  # settled: inside from some step <= 90 until 100; stay: never outside from 100 to 200
 CLOG_STEP, RECOVERED_UNTIL = 60, 120
 BEYOND = (10, 15, 25)  # points of flow past which a run from a good start counts as harmed
 NO_CONTROL = "do nothing"  # the controller that leaves every print alone
-BACK_BAND = 15.0  # within which a half clogged nozzle shall be brought back
+BACK_BAND = 15.0  # percent: to which the flow of a half clogged nozzle must return
 
 
 def harm_bar(case: str, *, perfect: float, in_band: float) -> float | None:

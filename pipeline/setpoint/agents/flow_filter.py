@@ -39,14 +39,14 @@ SPACING = 2.5  # percent: half the smallest move
 GRID = np.arange(FLOW_LIMITS[0], FLOW_LIMITS[1] + SPACING / 2, SPACING)  # (N,)
 ANYWHERE = 1 / GRID / np.sum(1 / GRID)  # errors of extrusion are ratios: 50 % is as likely as 200 %
 OUTLIERS = 0.01  # share of the windows that may show any flow of the grid
-FAR_OFF = 5.0  # deviations from its segment's median by which a window of the table is one of these
+FAR_OFF = 5.0  # deviations from its segment's median above which a window of the table is an outlier
 TAIL, FARTHEST = 4.0, 4.0  # Student's degrees of freedom; deviations up to which a segment misreads
 CLOGS, SURELY = (0.4, 1.05), 0.9  # factors on the flow at a jump, in this share of the jumps; else anywhere
-NOISE_WIDTH = 0.12  # of log flow, one deviation: over which a window's noise is smooth
-UNKNOWN_NOISE, UNKNOWN_BIAS = 0.05, 0.07  # of a table that shows classes only
+NOISE_WIDTH = 0.12  # bandwidth in log flow (one deviation) over which a window's noise is smoothed
+UNKNOWN_NOISE, UNKNOWN_BIAS = 0.05, 0.07  # if a table shows classes only
 LEAST_NOISE = 0.01  # few windows may agree by chance
-# corrections that begin with each of the five moves, in percent: a far flow takes many moves, and the fixed
-# cost is of the correction, not of each
+# corrections that begin with each of the five moves, in percent: a distant flow takes many moves, and the
+# fixed cost is charged once for the correction
 LARGEST = max(FLOW_MOVES)
 FARTHER = (2.0, 4.0, 8.0, 16.0)  # times the largest move
 CORRECTIONS = np.array([*FLOW_MOVES, *(-LARGEST * k for k in FARTHER), *(LARGEST * k for k in FARTHER)])
@@ -76,7 +76,7 @@ class FlowFilter(NamedTuple):
     border_std: Any
 
 
-@cache  # one pair of functions, so that what was compiled for it is found again
+@cache  # one pair of functions, so that its compiled program is used again
 def flow_filter(gains: int, biases: int) -> SetpointController:
     """Returns the filter with its greedy move, for FlowFilter parameters with this many gains and biases. Its
     memory is the belief (G, Z, N), zeros before the first window."""
@@ -118,7 +118,7 @@ def expected_loss(of: FlowFilter, belief: jax.Array, last_move: jax.Array | floa
     `last_move` continues a correction and does not begin one."""
     moves = jnp.asarray(FLOW_MOVES)
     miss = jnp.abs(GRID + of.gains[:, None] * jnp.asarray(CORRECTIONS)[:, None, None] - BEST_FLOW)
-    # of a miss on the border itself, as little as rounding is not outside
+    # a miss exactly on the border counts as inside, despite rounding
     outside = jax.scipy.special.ndtr((miss - 10.0 - 1e-3) / of.border_std)
     expected = jnp.einsum("cgn,gn->gc", miss + of.outside_cost * outside, belief.sum(axis=1)).sum(axis=0)
     expected = jax.ops.segment_min(expected, BEGINS, len(FLOW_MOVES))
@@ -131,7 +131,7 @@ def shifted(belief: jax.Array, move: jax.Array) -> jax.Array:
     leave the grid is kept on its last point."""
     steps = jnp.floor(move / SPACING)
     fraction = move / SPACING - steps
-    # one slice of the belief between zeros: looking up each point takes thrice as long
+    # one slice of the zero-padded belief: looking up each point takes three times as long
     room = len(GRID) + 1
     padded = jnp.pad(belief, [(0, 0)] * (belief.ndim - 1) + [(room + 1, room)])
     first = room - jnp.clip(steps.astype(jnp.int32), -room, room)
@@ -158,7 +158,8 @@ def fit(
         log_flow, error = np.log(table.flow / BEST_FLOW), np.log(table.flow_seen / table.flow)
         errors, order = segment_errors(table, width_bias_std=UNKNOWN_BIAS), np.argsort(log_flow)
         mean = smooth_mean(log_flow, error)
-        # one standard error more than found: segments taken for steadier than they are make good prints move
+        # one standard error more than estimated: if segments are assumed too steady, good prints are
+        # disturbed
         bias_std = errors.bias_std * (1.0 + 1.0 / np.sqrt(2.0 * len(errors.bias)))
         shown = log_grid + np.interp(log_grid, log_flow[order], mean[order])
         at = np.clip(log_grid, log_flow.min(), log_flow.max())

@@ -19,7 +19,7 @@ from pipeline.setpoint.agents.criteria import (
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 from pipeline.statistics import PooledShare, pooled_share, wilson
 
-# float32 sums of moves end a hair outside a border that they are on
+# tolerance: float32 sums of moves may end slightly outside a border that they should lie on
 ROUNDING = 1e-3
 
 

@@ -18,8 +18,8 @@ from pipeline.setpoint.simulation import actuation
 from pipeline.setpoint.simulation.actuation import ACTS, SetpointLimits, Waits
 from pipeline.setpoint.simulation.simulator import Observation, SetpointController
 
-# of the nozzle, for the alarm that the camera moved: at least LOOKS frames of a window are looked at; what is
-# less alike, or hardly more than at home, is not the nozzle elsewhere
+# for the alarm that the camera moved: at least LOOKS frames of a window are searched for the nozzle; a place
+# with less than LIKENESS, or hardly more than at home (ADVANTAGE), does not count as the nozzle
 TEMPLATE_PX, REACH_PX, LOOKS, LIKENESS, ADVANTAGE = 80, 30, 5, 0.4, 0.12
 
 # ---- the machine

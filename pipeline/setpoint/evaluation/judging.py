@@ -29,10 +29,10 @@ from pipeline.setpoint.simulation.simulator import (
 )
 from pipeline.statistics import mean_of_pools, pooled_share
 
-GOOD_STARTS = np.linspace(92.5, 107.5, STARTS)  # percent: prints that nothing is wrong with
+GOOD_STARTS = np.linspace(92.5, 107.5, STARTS)  # percent: flows of good prints
 # scale and exponent: it shows 12 % more at 100 %, and ratios smaller than they are
 OTHER_CAMERA = (1.12, 0.8)
-# points within which two contestants are alike in their worst case
+# percentage points within which the worst cases of two controllers count as equal
 ALIKE_POINTS = 2.0
 
 
@@ -117,7 +117,7 @@ def pools(tables: Sequence[WindowTable], size: int) -> list[list[WindowSource]]:
     size = max(min(size, *(len(own["bias"]) // 2 for own in arrays)), 1)
 
     def filled(name: str, a: np.ndarray) -> np.ndarray:
-        # what is filled up is never drawn: no flow lies beyond infinity, and `seen` says where windows end
+        # padding is never drawn: no flow lies beyond infinity, and `seen` gives the number of real windows
         fill = np.inf if name == "log_flow" else 0
         return np.pad(a, [(0, room[name] - len(a)), *[(0, 0)] * (a.ndim - 1)], constant_values=fill)
 

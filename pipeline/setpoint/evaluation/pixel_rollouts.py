@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.setpoint.agents import trials
 from pipeline.setpoint.deployment import pixels
 
-# decisions at the end of an episode that it must be inside for, to count as settled
+# decisions at the end of an episode during which it must keep the target, to count as settled
 DWELL = 10
 
 
@@ -15,8 +15,8 @@ class PixelRollouts(NamedTuple):
     """Episodes through rendered frames; empty if none were simulated."""
 
     calm: dict[str, pixels.Episodes]  # undisturbed ones by controller
-    disturbed: pixels.Episodes | None  # two of the default
-    words: tuple[str, ...]  # what befalls these two
+    disturbed: pixels.Episodes | None  # two episodes of the default controller
+    words: tuple[str, ...]  # the disturbances of these two
 
 
 def spread_starts(count: int, runs: int) -> np.ndarray:

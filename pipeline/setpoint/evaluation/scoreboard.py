@@ -16,7 +16,7 @@ from pipeline.setpoint.evaluation.pixel_rollouts import DWELL, PixelRollouts
 from pipeline.setpoint.simulation import actuation
 from pipeline.statistics import PooledShare, wilson
 
-# the cases of which runs of every controller are kept beside the deciding one, and so many decisions of them
+# cases whose runs are stored for every controller besides the deciding case, and their number of decisions
 PATHS_OF, PATH_STEPS = ("accuracy 0.7", "recorded, sticky"), 100
 
 

@@ -22,11 +22,11 @@ LEVELS = (1, 5, 25, 50, 75, 95, 99)  # percentiles of gray levels of the crop
 OCTAVES = 5
 # the strip beside the bead, in px across the line; the bead and its edges lie within REACH
 NEAR, REACH, START = 14, 28, 12
-# a frame's measures vary with its bead; a window's are the medians of a few: of so many that are spread over
-# it, or of the first accepted of every so many
+# a frame's measures vary with its bead, so a window's are the medians of a few frames: of FRAMES spread over
+# it, or of the first accepted frame of every MEASURED
 FRAMES, MEASURED = 4, 5
-# of windows of the known camera, the share that may be called foreign; pictures of other machines lie so far
-# off that it may be small
+# fraction of the known camera's windows that may be called foreign; it can be small, because pictures of
+# other machines differ so much
 FALSE_ALARMS = 0.01
 NAMES = (
     *(f"gray level, {p} %" for p in LEVELS),
@@ -250,7 +250,7 @@ def fit_camera(windows: np.ndarray, segment: np.ndarray, *, false_alarms: float)
         )
     learned = windows[np.isin(segment, names[::2])]
     mean, deviation = learned.mean(axis=0), learned.std(axis=0) + 1e-6
-    # here, as whoever renders, watches or controls fits none, and it takes longer to import than all else
+    # imported here, because only this function needs it, and it takes longer to import than everything else
     from sklearn.covariance import LedoitWolf
 
     covariance = LedoitWolf().fit((learned - mean) / deviation).covariance_

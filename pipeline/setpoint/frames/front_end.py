@@ -9,9 +9,9 @@ import numpy as np
 
 from pipeline.setpoint.frames import familiar, key_area, travel
 
-# frames among which the ground's motion is sought at a time
+# successive frames that are searched together for the ground's motion
 IN_A_ROW = 20
-# cameras of 10 and 12 bits may leave the upper ones of 16 empty; a picture as dark as that
+# cameras of 10 and 12 bits may leave the upper bits of 16 empty; a picture as dark as that
 # has fewer than 16 of 256 gray levels in any case
 FILLED_BITS = 12
 NO_TIP, UNUSABLE, SEVERAL = "no tip is known", "the frame cannot be used", "several lines"

@@ -20,8 +20,8 @@ SMALLEST = 64
 # ridges are sought in profiles across rays: radii every STRIDE px from START on (nearer, the rim of the
 # nozzle is seen), offsets every STEP px up to REACH
 START, STRIDE, STEP, REACH = 12, 3, 2, 28
-# (half-width of the strip, distance of its flanks, both in steps; weight): the line of an ordinary bead, and
-# a broad bead, which the shading of a part mimics better
+# (half-width of the strip, distance of its flanks, both in steps; weight): an ordinary bead, and a broad
+# bead, which is more easily confused with the shading of a part
 SCALES = ((1, 5, 1.0), (3, 8, 0.6))
 # the line may pass beside the calibrated tip by this many steps
 MISS = 4
@@ -33,12 +33,12 @@ OPEN = np.arange(-30, 211, COARSE)
 # a direction from G-code is trusted to this many degrees: the line
 # bends, and the camera's turn is known to a few
 LEEWAY_DEG = 6
-# another line that leaves the tip at least APART_DEG away and is this share as strong leaves it open which is
-# the fresh one
+# if another line leaves the tip at least APART_DEG away and is at least this fraction as strong, the fresh
+# line cannot be identified
 APART_DEG, RIVAL = 24, 0.35
-# a nozzle this close to where it was calibrated is at home
+# a nozzle this close to its calibrated place counts as at home
 HOME_PX = 2
-# what scores within this share of the best belongs to the same line
+# scores within this fraction of the best belong to the same line
 NEARLY = 0.1
 
 
@@ -302,8 +302,8 @@ def _ridge(gray: np.ndarray, direction_deg: float | None, leeway_deg: int) -> _R
         angles = round(direction_deg) + np.arange(-leeway_deg, leeway_deg + 1)
     score = _scores(small, _profiles()[:, angles % 360])
     best, at = float(score.max()), int(score.argmax()) % score.shape[1]
-    # what is nearly as strong has a say, so that a broad line is taken
-    # in its middle; never another line beside it
+    # average over scores that are nearly as strong, so that a broad line
+    # is taken in its middle; never over another line beside it
     beside = slice(max(at - 2, 0), at + 3)
     weight = np.maximum(score[:, beside] - (best - NEARLY * abs(best) - 1e-6), 0)
     weight /= weight.sum()

@@ -21,7 +21,7 @@ from pipeline.setpoint.frames.key_area import SIDE, KeyAreas, find_all
 # classes 0 below 90, 1 from 90 to 110, 2 above 110 percent of the nominal flow (paper,
 # section 2.2); the flows that a printer is set to
 BORDERS, FLOWS = (90.0, 110.0), (20.0, 310.0)
-# where flows to judge are uniform, in percent; deviation of log flow of the bump in those to learn from
+# range in which test flows are uniform, in percent; deviation of log flow of the bump in training flows
 JUDGED, BUMP = (70.0, 150.0), 0.25
 TEMPERATURES = (190.0, 200.0, 210.0, 220.0, 230.0)
 # a bead of nominal flow in px; a stadium of height h has the section (w - h) h + pi h^2 / 4, so that w =

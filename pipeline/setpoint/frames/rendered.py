@@ -8,15 +8,15 @@ import numpy as np
 
 from pipeline.setpoint.frames import familiar, nozzle_scene
 
-# bins of the true flow in percent: fine where controllers must find
-# 100 %, wide where any window says the same
+# bins of the true flow in percent: fine around 100 %, which controllers
+# must find, wide at flows where all windows look alike
 FLOW_EDGES = np.concatenate(
     [[20.0, 35, 50, 60, 70], np.arange(75, 125, 2.5), np.arange(125, 150, 5.0), np.arange(150, 311, 40.0)]
 )
-# in which a controller stays, and would see one window's chance again and again
+# range in which a controller stays; with few windows it would see the same random window again and again
 FINE = (75.0, 125.0)
-# a line that stands out less than its darker flank is none, whatever the least score; of windows by which a
-# camera is known, the score in gray levels below which a frame is not measured
+# a line with a score below LEAST_SCORE is none, whatever the user's least score; to learn a camera, frames
+# with a score below CAMERA_SCORE gray levels are not measured
 LEAST_SCORE, CAMERA_SCORE = 0.0, 10.0
 
 

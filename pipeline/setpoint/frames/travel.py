@@ -19,13 +19,14 @@ from pipeline.setpoint.frames.key_area import SIDE
 # ground below the tip, reduced by STEP; rows nearer than BELOW px show the nozzle's rim
 STEP, BELOW = 2, 8
 SHAPE = ((SIDE // 2 - BELOW) // STEP, SIDE // STEP)
-# a run is a frame with so many on either side, at an end of the film the first or last of as many; fewer
-# pairs than LEAST say nothing
+# a run is a frame with RUN frames on either side (at an end of the film, the first or last 2 RUN + 1); fewer
+# pairs than LEAST are not enough
 RUN, LEAST = 3, 5
-# a shift stands out by so many deviations of the correlation, by such a factor over any other, and is so long
+# a shift must stand out by this many deviations of the correlation, by this factor over any other, and be
+# this long
 DEVIATIONS, FACTOR, SHORTEST_PX = 8.0, 1.3, 3.0
-# and it is, within STEP px, the likeliest of this share of the run's pairs: frames of no film, or of a stage
-# that goes to and fro, have a shift each
+# and, within STEP px, it must be the likeliest shift in this fraction of the run's pairs; if the frames are
+# not from a film, or the stage moves to and fro, each pair has another shift
 AGREE = 0.8
 # streaks of at least this coherence give the motion's axis; it turns by at most TURN_DEG in a run, and the
 # shift lies within ALONG_DEG of it

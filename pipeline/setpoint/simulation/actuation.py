@@ -21,7 +21,7 @@ REASONS = (
     "the picture stands still",
 )
 ACTS, FEW, FOREIGN, TIP, UNPROVEN, STILL = range(6)
-REMEMBERED = 64  # actions that the travel of 60 s is summed over: a window takes about a second
+REMEMBERED = 64  # actions remembered for the travel of 60 s: a window takes about a second
 
 
 # ---- when to hold

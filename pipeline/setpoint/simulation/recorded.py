@@ -18,8 +18,8 @@ import numpy as np
 
 from pipeline.setpoint.simulation.simulator import GOOD_BORDERS, EpisodeConditions, WindowSource
 
-UNSEEN = np.array(np.nan)  # of a table of classes only
-DITHER = 1e-3  # of log flow_seen: a window drawn twice is not a picture that stands still
+UNSEEN = np.array(np.nan)  # value in a table of classes only
+DITHER = 1e-3  # added to log flow_seen, so that a window drawn twice does not look like a frozen picture
 
 
 class WindowTable(NamedTuple):
@@ -48,7 +48,7 @@ def with_flows(table: WindowTable) -> bool:
     return bool(np.isfinite(table.flow_seen).all())
 
 
-NEAREST = 40  # windows that an error is drawn from, or all where there are fewer
+NEAREST = 40  # windows from which an error is drawn; all if there are fewer
 
 
 class _Ranked(NamedTuple):
@@ -82,7 +82,7 @@ class SegmentErrors(NamedTuple):
     bias_std: float
 
 
-# segments that the declared deviation counts for, beside the table's own
+# number of segments that the declared deviation weighs, besides the table's own
 DECLARED_SEGMENTS = 5
 
 
@@ -102,7 +102,7 @@ def segment_errors(table: WindowTable, *, width_bias_std: float) -> SegmentError
     segment_mean = np.bincount(place, about) / counts
     within = about - segment_mean[place]
     free = len(error) - len(counts)
-    if free <= 0:  # one window a segment: nothing parts the two
+    if free <= 0:  # one window for each segment: the two parts cannot be separated
         return SegmentErrors(error, np.zeros(1), width_bias_std)
     variance = (within**2).sum() / free
     between = max(0.0, float((segment_mean**2).mean() - variance * (1 / counts).mean()))
@@ -113,7 +113,7 @@ def segment_errors(table: WindowTable, *, width_bias_std: float) -> SegmentError
     return SegmentErrors(mean + within * inflate, own, float(bias_std))
 
 
-MEAN_BANDWIDTH = 0.08  # of log flow, one deviation: over which a camera's mean error is smooth
+MEAN_BANDWIDTH = 0.08  # bandwidth in log flow (one deviation) over which a camera's mean error is smoothed
 
 
 def smooth_mean(x: np.ndarray, y: np.ndarray) -> np.ndarray:

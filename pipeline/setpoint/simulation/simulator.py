@@ -38,12 +38,12 @@ from pipeline.setpoint.simulation.actuation import SetpointLimits, Setpoints
 
 STAND = 2  # the index of no move
 FLOW_LIMITS, TEMPERATURE_LIMITS = (20.0, 310.0), (180.0, 240.0)
-LIMITS = SetpointLimits(  # of what is sent: the largest change of one action, and of 60 s
+LIMITS = SetpointLimits(  # range, then the largest change in one action, and in 60 s
     *(np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True)),
     np.array([10.0, 20.0]),
     np.array([100.0, 60.0]),
 )
-REMEMBERED = 16  # actions of the last 60 s that limits are of: one takes at least 4 s
+REMEMBERED = 16  # actions remembered for the 60 s limit: each takes at least 4 s
 WINDOW_S = 1.0
 HISTORY, CLASSES = 30, 3  # eta and n_c of (8)
 UNDER, GOOD, OVER = 0, 1, 2
@@ -188,7 +188,7 @@ def _paper_draw(
     z = _normal(u[1:])
     noise = SIGMA * jnp.stack(
         [z[0], jnp.where(x0 == 0, z[0], z[1]), z[1]]
-    )  # two numbers serve, as x0 itself takes none
+    )  # two random numbers suffice, since x0 itself needs none
     prob = jnp.where(distance == 0, 1.0, jnp.clip(jnp.exp(-ALPHA * distance) + noise, 0.0, 1.0))
     return prob / prob.sum(), x0, jnp.full_like(u[0], jnp.nan)
 
@@ -238,7 +238,7 @@ def stepped(
     change, step = sent.value - state.sent.value, state.step + 1
     wait_s = actuation.wait_after(change, actuation.Waits(*3 * (conditions.wait_s,)))
     flow = jnp.where(step >= conditions.clog_step, conditions.clog, 1.0) * sent.value[0]
-    # of what the window's middle shows, the share that was laid before the move
+    # fraction of the material visible in the middle of the window that was laid before the move
     before = jnp.clip(1.0 - (wait_s + WINDOW_S / 2) / jnp.maximum(conditions.view_s, 1e-3), 0.0, 1.0)
     shown = flow + (state.flow - flow) * before
     state = MachineState(
@@ -295,9 +295,9 @@ def rollout(
     """Simulates every episode of `conditions` (n,) for `steps` decisions in one compiled program. The same
     key gives identical results."""
     n = conditions.flow.shape[0]
-    own, world = jax.random.split(key)  # the controller's chance is not the world's
-    # chance is drawn outside of the program, as its generator takes longer to compile than the rest; so are
-    # the first windows, which are the same program for every controller
+    own, world = jax.random.split(key)  # separate random numbers for controller and machine
+    # random numbers are drawn outside of the program, because their generator takes longer to compile than
+    # the rest; so are the first windows, with one program for every controller
     u = jax.random.uniform(world, (steps + 1, n, CHANCES))
     first = _first(windows, conditions, u)
     return _rolled(controller, parameters, windows, conditions, jax.random.split(own, n), first, u)

@@ -16,7 +16,7 @@ from pipeline.setpoint.vision.classifier import Labelled, TrainState
 from pipeline.setpoint.vision.parts import all_frames
 from pipeline.setpoint.vision.proof import may_judge, verdict
 
-# yardsticks learn from one frame in so many: they take ten times as long a frame
+# reference methods learn from one frame in EVERY, because they take ten times as long for each frame
 EVERY = 3
 
 
@@ -24,9 +24,9 @@ class Assessment(NamedTuple):
     """The classifier's results on test frames; it learned from none of them."""
 
     fitted: ClassifierCalibration
-    frames: ClassifierOutputs  # of the classifier on them, rejected ones too
+    frames: ClassifierOutputs  # the classifier's outputs on these frames, including rejected ones
     windows: WindowPredictions
-    yardsticks: dict[str, np.ndarray]  # (n,) classes named by simpler ways, by name; none of few own pictures
+    yardsticks: dict[str, np.ndarray]  # (n,) classes by reference method; empty for few own pictures
 
 
 def fewer(learned: Labelled) -> Labelled:

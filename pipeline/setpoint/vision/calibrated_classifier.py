@@ -187,7 +187,7 @@ def foreign_detection(
 def yardstick_classes(learned: Labelled, data: Labelled) -> dict[str, np.ndarray]:
     """Returns the classes (n,) of the frames `data` by two references: a support vector machine on the
     profile, and the width. Both are fitted to valid frames that the network learned."""
-    from pipeline.setpoint.vision import yardsticks  # here, as who only classifies needs none
+    from pipeline.setpoint.vision import yardsticks  # imported here, since classifying does not need it
 
     machine = yardsticks.fit_profile_machine(
         learned.key_area, learned.temperature_degC, learned.label, learned.segment

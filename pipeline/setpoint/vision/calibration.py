@@ -211,7 +211,7 @@ def fit_familiar(features: np.ndarray, label: np.ndarray) -> Familiar:
     2018) that is shrunk (Ledoit and Wolf 2004)."""
     features, label = np.asarray(features, float), np.asarray(label)
     means = np.array([features[label == c].mean(axis=0) for c in range(CLASSES)])
-    from sklearn.covariance import LedoitWolf  # here, as who only classifies fits none
+    from sklearn.covariance import LedoitWolf  # imported here, since classifying does not need it
 
     covariance = LedoitWolf(assume_centered=True).fit(features - means[label]).covariance_
     covariance += 1e-9 * np.trace(covariance) / len(covariance) * np.eye(len(covariance))

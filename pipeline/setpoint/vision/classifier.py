@@ -159,8 +159,8 @@ def along_bead(key: Array, x: Float[Array, "n 16 48"]) -> Float[Array, "n 16 48"
 # ---- training
 
 
-AT_ONCE = 512  # images looked at together: what the paper's size holds of them then stays below 1 GB
-AT_ONCE_ON_CPU = 16  # images predicted together: what a CPU's caches hold, and little of it padded
+AT_ONCE = 512  # images processed together, so that a network of the paper's size needs less than 1 GB
+AT_ONCE_ON_CPU = 16  # images predicted together: they fit a CPU's caches, and little is padded
 ADAM = optax.scale_by_adam()  # Kingma and Ba 2015, its own beta 0.9 and 0.999
 
 
@@ -342,7 +342,7 @@ def _step(augment, carry, drawn: tuple[Array, Array], rows: list[Array], rates: 
     direction, opt_state = ADAM.update(gradient, opt_state)
     rate = cosine(t, rates)
     network = jax.tree.map(lambda w, d: w - rate * (d + rates.weight_decay * w), network, direction)
-    keep = jnp.minimum(rates.averaging, (1 + t) / (10 + t))  # the first steps are forgotten sooner
+    keep = jnp.minimum(rates.averaging, (1 + t) / (10 + t))  # forgets the first steps sooner
     return (network, jax.tree.map(lambda a, w: keep * a + (1 - keep) * w, average, network), opt_state), loss
 
 
@@ -375,7 +375,7 @@ def _judged(state: TrainState, loss: Array, outputs: tuple, truth: list[Array]) 
     row = jnp.stack([loss.mean(), total_loss(outputs, *truth, 0.0), jnp.mean(right)])
     better = row[1] < jnp.min(
         jnp.nan_to_num(state.history[:, 1], nan=jnp.inf)
-    )  # never where the loss is no number
+    )  # never if the loss is not a number
     best = jax.tree.map(lambda new, old: jnp.where(better, new, old), state.average, state.best)
     history = state.history.at[state.epoch].set(row)
     return state._replace(

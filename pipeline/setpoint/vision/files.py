@@ -109,7 +109,7 @@ def restore_classifier(weights_path: str, calibration_path: str) -> CalibratedCl
 def train_from_checkpoint(train: Callable, state: TrainState, checkpoint: Path) -> TrainState:
     """Returns train(state, on_step=...), continued from the checkpoint if there is one. Writes the checkpoint
     after each epoch."""
-    with contextlib.suppress(ValueError):  # there is none yet, or it is damaged: from the beginning
+    with contextlib.suppress(ValueError):  # no checkpoint, or a damaged one: start from the beginning
         state = from_named_arrays(state, read_weights(checkpoint, CLASSIFIER_SCHEMA)[0])
     done, words = int(state.epoch), "train_classifier"
     with tqdm(total=len(state.history), initial=done, desc=words, unit="epoch", mininterval=2) as bar:

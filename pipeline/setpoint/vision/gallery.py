@@ -64,7 +64,7 @@ def choose_frames(groups: Groups, frames: Any) -> list[int]:
     def of(group: str) -> np.ndarray:
         return np.flatnonzero(groups.group == group)
 
-    # of those at which a line was looked for: the others have no picture, or no tip
+    # only frames that were searched for a line: the others have no picture, or no tip
     accepted, rejected = of(ACCEPTED), np.flatnonzero((groups.group == REJECTED) & np.isfinite(frames.score))
     by_class = [_spread(accepted[frames.label[accepted] == c]) for c in range(3)]
     by_reason = [_spread(np.array([i for i in rejected if kinds[i] == kind], int)) for kind in order]

@@ -24,13 +24,13 @@ from pipeline.setpoint.vision.parts import all_frames
 from pipeline.setpoint.vision.vision_transformer import LOG_DEVIATION, Classifier
 from pipeline.setpoint.vision.window_flow import FlowCalibration, WindowFlow, class_probabilities
 
-# from so many stretches of constant settings on the network itself is trained
+# with at least this many stretches of constant settings the network itself is trained
 TRAINED_FROM = 2000
 PENALTY = 10.0
-# prints are left out one at a time, many of them in so many groups; each class is in so many prints at least,
-# as two are left out at a time
+# prints are left out one at a time, many prints in this many groups; each class must be in at least this many
+# prints, because two are left out at a time
 MOST_GROUPS, LEAST_PRINTS = 12, 3
-# share of the windows by whose errors the spread is stretched
+# fraction of the windows whose errors determine how much the spread is enlarged
 COVERED = 0.8
 
 

@@ -11,7 +11,7 @@ from pipeline.setpoint.frames.rendered import LabelledFrames
 from pipeline.setpoint.vision import calibration
 from pipeline.setpoint.vision.classifier import CLASS_NAMES, Labelled, split_by_segment
 
-# of the yardstick that is fitted beside the networks, yardsticks.fit_profile_machine
+# folds of the reference method fitted beside the networks, yardsticks.fit_profile_machine
 FOLDS = 3
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from pipeline.setpoint.frames.familiar import FALSE_ALARMS, needed_windows
 
-# one-sided, of the share of windows that are named rightly
+# one-sided, for the fraction of windows classified correctly
 CONFIDENCE = 0.9
 
 

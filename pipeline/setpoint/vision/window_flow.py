@@ -14,7 +14,7 @@ from pipeline.setpoint.frames import familiar
 from pipeline.setpoint.frames.nozzle_scene import BORDERS
 
 CLASSES = 3
-# where the map from what frames show to the flow has its knots, in percent; between them it is linear
+# knots, in percent, of the map from what frames show to the flow; it is linear between them
 KNOTS_PERCENT = (
     10.0,
     20.0,
@@ -32,12 +32,12 @@ KNOTS_PERCENT = (
     310.0,
     620.0,
 )
-# windows that weigh as much as the wish for a straight map, and the flattest slope that is believed
+# weight of the penalty on changes of slope, in windows, and the smallest slope that is accepted
 STRAIGHT, LEAST_SLOPE = 3.0, 0.1
 
 
-# flows in percent from whose windows it is learned how looks move what is shown, the penalty of its ridge,
-# and the deviations beyond which a look says no more
+# range of flows in percent whose windows are used to fit the look correction, its ridge penalty, and the
+# number of deviations at which a look is clipped
 LOOKED_PERCENT, LOOK_PENALTY, FURTHEST_LOOK = (50.0, 200.0), 3.0, 3.0
 
 
@@ -189,7 +189,7 @@ def _fit_map(hats: np.ndarray, shown: np.ndarray) -> np.ndarray:
     """Returns what frames show at the knots (k,), rising. `hats` (w, k): weights of the windows; `shown`
     (w,): what they show on average."""
     straight, knots = STRAIGHT * _straight().T @ _straight(), _knots()
-    slopes = np.eye(len(KNOTS_PERCENT))[[0, -1]] * 1e-6  # keeps ends that nobody saw finite
+    slopes = np.eye(len(KNOTS_PERCENT))[[0, -1]] * 1e-6  # keeps ends without data finite
     fitted = np.linalg.solve(
         hats.T @ hats + straight + slopes.T @ slopes, hats.T @ shown + slopes.T @ slopes @ knots
     )
@@ -206,7 +206,7 @@ def _correlation(residual: np.ndarray, valid: np.ndarray) -> float:
     m = valid.sum(axis=1)
     pairs = (m * (m - 1)).sum()
     if pairs == 0:
-        return 1.0  # windows of one frame: nothing says that more would tell more
+        return 1.0  # windows of one frame: it is unknown if more frames would give more information
     products = (r.sum(axis=1) ** 2 - (r**2).sum(axis=1)).sum() / pairs
     return float(np.clip(products / ((r**2).sum() / m.sum()), 0.0, 1.0))
 
