@@ -62,8 +62,8 @@ def image_features(w, x):
 
 
 def outputs(w, key_area, temperature_degC):
-    """Returns logits (n, 3), log(flow / 100 %) (n,) and its standard deviation (n,) of key areas (n, 16, 48)
-    in gray levels at nozzle temperatures (n,) in °C, from features averaged over each area's four mirror
+    """Returns logits (n, 3), log(flow / 100 %) (n,) and its standard deviation (n,). `key_area` (n, 16, 48)
+    in gray levels; `temperature_degC` (n,) of the nozzle. Features are averaged over each area's four mirror
     images."""
     x, t = np.asarray(key_area, np.float32), np.asarray(temperature_degC, np.float32)[:, None]
     u = np.maximum(dense(w, "head.temperature", (t - 210) / 20), 0)

@@ -106,35 +106,35 @@ LAW, OWN, OFF = range(3)
 
 WINDOWS, SPACING = 6, 6  # forecasts side by side, and samples from one to the next
 STILL_AFTER = 10  # samples for which a forecast must have been away before a sensor stands still
-FIT_AFTER = 12  # samples of a window before it tells of a heater
+FIT_AFTER = 12  # least samples of a window before a heater is judged by it
 STEPS_STILL, NOISE_STILL = 3.0, 4.0  # steps and deviations that a forecast must move
 SAME_STEPS, SAME_NOISE = 1.5, 6.0  # steps and deviations within which a reading has not moved
 FOLLOWS = (0.7, 1.4)  # share of the forecast's move by which a sensor is cleared
-CLEARED_S = 60.0  # for how long it is cleared then
-# why readings miss the forecast: a heater lacks a share, or gives one of what it could add; heat of the
-# surroundings as a share of the input's range; samples late; a heater that differs from the model by a share;
-# a step of the reading in degC
+CLEARED_S = 60.0  # for how long it then counts as cleared
+# why readings differ from the forecast: a heater lacks a share, or gives a share of what it could add; heat of
+# the surroundings as a share of the input's range; samples late; a heater that differs from the model by a
+# share; a step of the reading in degC
 LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS = range(6)
 LEAST = np.array([0.35, 0.6, -0.3, -8.0, -0.25, -1e3])
 MOST = np.array([1.0, 1.5, 0.3, 8.0, 0.25, 1e3])
-CLEARER = 16.0  # of -2 log likelihood, by which a fault must explain better than what is none
-MISFIT = 0.15  # of what readings miss, which even the right cause leaves: no model is the machine
-DOUBT = 0.25  # share of what inputs did lately by which a forecast may be wrong
-RESTS = 1 / 40  # share a sample by which that is forgotten
-REPEATED = 3  # samples in a row with a reading that is none
-SHOWN = 6  # samples in a row that show a fault
-SLOWLY = 1 / 60  # share a sample of the mean drift, from which heat is counted
-EARLY, JUMP = 0.5, 10.0  # shares of the sample time between which two samples are apart
-MOST_STEP_DEGC = 5.0  # what moves by more at first was perhaps switched on
+CLEARER = 16.0  # of -2 log likelihood, by which a fault must explain better than causes that are no fault
+MISFIT = 0.15  # fraction of the readings' error that even the right cause leaves, since no model is exact
+DOUBT = 0.25  # fraction of the inputs' recent effect by which a forecast may be wrong
+RESTS = 1 / 40  # fraction by which this effect fades in each sample
+REPEATED = 3  # successive samples with an invalid reading
+SHOWN = 6  # successive samples that must show a fault
+SLOWLY = 1 / 60  # fraction by which the mean drift follows in each sample
+EARLY, JUMP = 0.5, 10.0  # shortest and longest valid time between two samples, in sample times
+MOST_STEP_DEGC = 5.0  # a larger first move may come from power-on
 # a sensor's steps until it has moved: one of 2.5 degC moves before its forecast has moved enough to judge it
 UNKNOWN_STEP_DEGC = 1.0
-# shares of an input's range, of heat that is missing; with the heater at its limit
+# missing heat that counts, as shares of an input's range: in general, and with the heater at its limit
 MISSING, AT_LIMIT = 0.4, 0.1
-MISSING_FOR, DOOR_S = 60, 110.0  # for so many samples, and longer than a door is open
+MISSING_FOR, DOOR_S = 60, 110.0  # for how many samples it must be missing; longest time that a door is open
 FAR_DEGC = 1e4  # no machine is so hot: its model is unstable, and no reading corrects it
 SETTLES = 30  # samples from the first, in which the observer finds the machine and no forecast begins
 BACK_S = 30.0  # without a cause, after which the law takes over again
-RETURNS = 3  # times an hour that heaters which went off are tried again
+RETURNS = 3  # times an hour that heaters are tried again after they went off
 
 
 class Supervision(NamedTuple):
@@ -268,26 +268,32 @@ class Kept(NamedTuple):
     """All that the supervisor remembers, in arrays that are changed in place.
 
     By kind and signal (k, w): `since` and `last`, first and last time of a cause, in s of the supervisor's
-    own time, -1 if there is none; `amount`. The observer: `x` (n,); `e` (p,), the last innovation; `slow`
-    (p,), the mean drift; `expected` (p,), the forecast. By output (p,): `y`, the last reading, and its
-    `repeats`; `quantum`, the smallest move seen (infinite: none; NaN: a large one, perhaps of power-on);
-    `bad`, successive bad readings; `cleared_s`, the time at which it last moved as forecast; `returns`, how
-    often it was trusted again, the last time at `returned_s`.
+    own time, -1 if there is none; `amount`.
+
+    The observer: `x` (n,); `e` (p,), the last innovation; `slow` (p,), the mean drift; `expected` (p,), the
+    forecast.
+
+    By output (p,): `y`, the last reading, and its `repeats`; `quantum`, the smallest move seen (infinite:
+    none; NaN: a large one, perhaps of power-on); `bad`, successive bad readings; `cleared_s`, the time at
+    which it last moved as forecast; `returns`, how often it was trusted again, the last time at `returned_s`.
 
     Windows (K): `states` (2, K, n), from the drift as it was and from its mean; `given` and `unit` (K, n, m),
     the responses to the inputs and to one percent of each; `before` (K, q), the output of `given` a sample
-    ago; `began`, `first`, `least`, `most` (K, p): the forecast and the reading at the start, the least and
-    the largest reading; `away` (K, p): successive samples in which the forecast was away from where it began;
-    `square` (K, q): the sum of r^2; `causes` (K, q, 6): that of each cause's signature squared; `cross` (K,
-    K, q, 6): that of r of a window times the signature of a cause that began with another window; `total` (2,
-    K, p): those of the reading minus `began`, and of its square; `age` (K,): in samples, -1 for no window.
+    ago; `age` (K,), in samples, -1 for no window. Readings in a window (K, p): `began` and `first`, the
+    forecast and the reading at the start; `least` and `most`, the least and the largest reading; `away`,
+    successive samples in which the forecast was away from where it began. Sums over a window: `square` (K,
+    q), of r^2; `causes` (K, q, 6), of each cause's signature squared; `cross` (K, K, q, 6), of r of a window
+    times the signature of a cause that began with another window; `total` (2, K, p), of the reading minus
+    `began`, and of its square.
 
-    `shown` (2, m): successive samples in which a heater was stuck on, or weak; `missing` (m,): in which its
-    heat was missing. `asked` (m,): the last command; `usual` (m,): its mean; `stirred` (m,): how far it was
-    from its mean lately; `forward` (m,): what was added to it for disturbances. This makes up for the
-    disturbances, so forecasts run without both. `counters` (6,): samples; mode; 1 once the clock was read;
-    present causes; calls of `step`; 1 after an invalid time step of the clock. `clock_s` (2,): the clock at
-    the last sample, and the supervisor's own time, which never decreases.
+    By heater (m,): `shown` (2, m), successive samples in which it was stuck on, or weak; `missing`, in which
+    its heat was missing; `asked`, the last command; `usual`, its mean; `stirred`, how far it was from its
+    mean lately; `forward`, what was added to it for disturbances. This makes up for the disturbances, so
+    forecasts run without both.
+
+    `counters` (6,): samples; mode; 1 once the clock was read; present causes; calls of `step`; 1 after an
+    invalid time step of the clock. `clock_s` (2,): the clock at the last sample, and the supervisor's own
+    time, which never decreases.
     """
 
     since: np.ndarray
@@ -427,7 +433,7 @@ def begin_window(s: Supervision, k: Kept, at: int) -> None:
         part[at] = 0
     k.cross[:, at] = k.total[:, at] = 0.0
     k.began[at] = s.C @ start + s.d
-    # a sensor may be far from its forecast: whether it moves is told from its own readings
+    # a sensor may be far from its forecast, so whether it moves is judged by its own readings
     k.first[at] = k.least[at] = k.most[at] = np.where(np.isfinite(k.y), k.y, k.began[at])
     k.age[at] = 0
 
@@ -513,7 +519,7 @@ def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
     left = np.where(later[:, :, None, None], np.maximum(left, floor[:, None, :, None]), 1e300)
     honest = np.minimum(left[..., HEAT:].min(axis=(1, 3)), np.maximum(k.square, floor))
     same = k.most - k.least <= same_degC(s, k)
-    # a heater that is stuck on heats, and by more than the drift of either forecast
+    # a heater that is stuck on must heat, and by more than the drift of either forecast
     heats = (y - k.least > same_degC(s, k)) & (-both_ahead(s, k, y) >= least)
     judge_sensors(s, k, moves, still & same, honest, noise)
     left, honest, floor = left[:, :, :m], honest[:, :m], floor[:, :m]
@@ -575,8 +581,8 @@ def judge_sensors(
         steady = k.total[1, :, j] - k.total[0, :, j] ** 2 / age[:, 0]
         floor = noise[:, j] + MISFIT**2 * square + 1e-12
         better = age[:, 0] * np.log(honest[:, heaters].min(axis=1) / np.maximum(steady, floor))
-        # what moves a heater is a reading that moved: nothing honest keeps one equal meanwhile, unless its
-        # steps hide what the law makes up for
+        # a heater moves because a reading moved, so a healthy sensor cannot stay equal meanwhile, unless its
+        # steps hide what the law compensates
         equal = (k.repeats[j] >= age[:, 0]) & (known_steps(k.quantum)[j] <= s.noise_degC[j])
         clear = still[:, j] & ((better >= CLEARER) | equal)
         if clear.any():
