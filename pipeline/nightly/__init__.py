@@ -12,7 +12,7 @@ promotion**: git's references move all or none, and the folders in champion/ fol
 In neither: `.beadline/` (ignored), with the lock, the copy, a note of a landing in progress, the runs so far,
 the logs, and what the last run saw. If it is lost, one run is repeated.
 
-The rule: a challenger is promoted if, on scenarios that no stage learns from, a paired test finds it better
-beyond noise and by a margin that is worth a change, no guard figure is worse, and nothing has drifted.
-Otherwise the champion is kept.
+A challenger is promoted if a paired test, on scenarios that no stage learns from, finds it better beyond
+noise and by a margin that is worth a change. Also, no guard figure may be worse, and nothing may have
+drifted. Otherwise the champion is kept.
 """

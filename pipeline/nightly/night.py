@@ -245,7 +245,7 @@ def _tell_unused(loop: NightlyLoop, recordings: Sequence[str]) -> list[str]:
 
 
 def _name_few(paths: Sequence[str]) -> str:
-    """ "a, b, c and 2 more"."""
+    """Returns "a, b, c and 2 more"."""
     return ", ".join(paths[:3]) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
 
 

@@ -1,5 +1,5 @@
 """The closed loop through pixels: setpoints -> heater and melt -> rendered frames -> key areas -> classifier
--> window -> hold or controller -> setpoints."""
+-> window -> controller, or no action -> setpoints."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -315,7 +315,7 @@ def _advance(
     ticks: np.ndarray,
     tick_s: float,
 ):
-    """The state after ticks (E,), and the flow and temperature (E, most) of each tick."""
+    """Returns the state after `ticks` (E,), and the flow and temperature (E, most) of each tick."""
     flows, temperatures = np.zeros((2, len(feed), ticks.max(initial=0)))
     for k in range(ticks.max(initial=0)):
         state, flows[:, k] = tick(machine, state, feed, target, k < ticks, tick_s=tick_s)

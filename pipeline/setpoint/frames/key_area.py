@@ -121,10 +121,10 @@ def find_in(
     below `least_score` gray levels.
 
     `direction_deg` is known from G-code or from the motion of the ground. If it is given, only rays within
-    `leeway_deg` of it are searched, also those over the nozzle, and only lines that pass the tip within MISS
-    steps, so lines further away are ignored. If it is not given, the strongest ridge not hidden by the nozzle
-    is taken. If another line is nearly as strong, the frame is rejected, because one picture cannot tell
-    which line was laid last.
+    `leeway_deg` of it are searched, also those over the nozzle. Only lines that pass the tip within MISS
+    steps count, so lines further away are ignored. If it is not given, the strongest ridge not hidden by the
+    nozzle is taken. If another line is nearly as strong, the frame is rejected, because one picture cannot
+    tell which line was laid last.
     """
     ridge = _ridge(c.gray, direction_deg, leeway_deg)
     angle, miss, score = ridge.angle_deg, ridge.miss_px, ridge.score
@@ -394,7 +394,7 @@ def corners(angle_deg: float, miss_px: float) -> np.ndarray:
 
 
 def _equalisation(gray: np.ndarray) -> np.ndarray:
-    """(256,) uint8: the table of cv2.equalizeHist for this picture."""
+    """Returns the table of cv2.equalizeHist for this picture, (256,) uint8."""
     counts = cv2.calcHist([gray], [0], None, [256], [0, 256]).ravel()
     first = int((counts > 0).argmax())
     if counts[first] == gray.size:

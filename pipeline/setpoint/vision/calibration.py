@@ -124,8 +124,8 @@ def share_by_segment(
     """Returns the percentage of True among n images or windows, with its interval. Images of one segment (n,)
     err together, so segments are treated as the random sample. `weight` (n,), of mean 1, weighs each image.
 
-    It is Wilson's interval for n_eff = p (1 - p) / V images, with V the variance of a ratio of sums over
-    segments, and a factor for Student's t of few segments (Korn and Graubard 1998). n_eff is at most n; it is
+    It is Wilson's interval for n_eff = p (1 - p) / V images (Korn and Graubard 1998). V is the variance of a
+    ratio of sums over segments; a factor accounts for Student's t of few segments. n_eff is at most n; it is
     the number of segments if all values are True or all False. Without images: NaN.
     """
     happened, n = np.asarray(happened, float), len(happened)

@@ -233,7 +233,7 @@ def cosine(step: Array, rates: Rates) -> Array:
 
 
 def cross_entropy(logits: Float[Array, "n 3"], label: Array, smoothing: float) -> Array:
-    """Mean of -sum_c t_c log p_c with targets t = (1 - smoothing) one-hot + smoothing / 3."""
+    """Returns the mean of -sum_c t_c log p_c with targets t = (1 - smoothing) one-hot + smoothing / 3."""
     target = (1 - smoothing) * jax.nn.one_hot(label, CLASSES) + smoothing / CLASSES
     return -jnp.mean(jnp.sum(target * jax.nn.log_softmax(logits), axis=1))
 
