@@ -111,8 +111,8 @@ STEPS_STILL, NOISE_STILL = 3.0, 4.0  # steps and deviations that a forecast must
 SAME_STEPS, SAME_NOISE = 1.5, 6.0  # steps and deviations within which a reading has not moved
 FOLLOWS = (0.7, 1.4)  # share of the forecast's move by which a sensor is cleared
 CLEARED_S = 60.0  # for how long it then counts as cleared
-# why readings differ from the forecast: a heater lacks a share, or gives a share of what it could add; heat of
-# the surroundings as a share of the input's range; samples late; a heater that differs from the model by a
+# why readings differ from the forecast: a heater lacks a share, or gives a share of what it could add; heat
+# of the surroundings as a share of the input's range; samples late; a heater that differs from the model by a
 # share; a step of the reading in degC
 LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS = range(6)
 LEAST = np.array([0.35, 0.6, -0.3, -8.0, -0.25, -1e3])
