@@ -1,6 +1,6 @@
-"""A controller of the comparison as it is exported: with its safe mode, its supervisor and the machine it is
-for; and played on healthy machines of the test set. As long as the supervisor finds no fault there, what runs
-is the law, and the law's figures are those of what runs."""
+"""Assembles a controller of the comparison for export, with its safe mode, its supervisor and its machine,
+and plays it on healthy machines of the test set. As long as the supervisor finds no fault there, the exported
+controller behaves exactly as the law, so the law's figures apply to it."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -29,14 +29,15 @@ from pipeline.temperature.tracking import reached_state, riccati
 
 LEAK = 0.9999  # of the drift, kept a step
 RESTLESS = 1e8  # condition of I - A above which a plant has no rest of its own
-WEAK_SHARE = 1e-3  # of what inputs move most, below which they are not said to hold a temperature
-HURRIED = 0.1  # of an innovation, by which the drift follows in manual
-# what takes over if the law is left: the control that the machine has, or a PI in its place
+WEAK_SHARE = 1e-3  # of the largest effect of inputs; with less they do not count as holding a temperature
+HURRIED = 0.1  # fraction of an innovation by which the drift follows in manual
+# control that takes over in the safe mode: the machine's own, or a PI in its place
 OWN_CONTROL = ("printer_pid", "pi", "pi_simc")
 
 
 def own_control(designs: Mapping[str, Design]) -> Design | None:
-    """The first of OWN_CONTROL that holds its model stable; without one the heaters go off."""
+    """Returns the first of OWN_CONTROL that keeps its model stable. If there is none, the heaters go off in
+    the safe mode."""
     for name in OWN_CONTROL:
         if name in designs:
             loop = closed_loop(designs[name].model, designs[name].law)
@@ -55,8 +56,8 @@ def assemble(
     *,
     simulated: bool,
 ) -> Exported:
-    """The controller as it was judged. `fallback` is the safe mode "own"; None: the heaters go off. `family`
-    is the identified plant, then its spread."""
+    """Returns the controller as it was judged. `fallback`: the safe mode "own"; None: the heaters go off.
+    `family`: the identified plant, then its spread."""
     return canonical(
         Exported(
             name,
@@ -75,9 +76,9 @@ def assemble(
 def supervision(
     model: Plant, machine: Machine, noise_degC: np.ndarray, *, drift: float = 0.05, follows: float = 0.3
 ) -> Supervision:
-    """The observer of the stationary Riccati equation: outputs are moved a step by `follows` of the sensors'
-    noise (p,), along the state that inputs reach, and the drift wanders by `drift` of it. Raises ValueError
-    for noise that is no number above zero."""
+    """Returns the supervisor's parameters. Its observer solves the stationary Riccati equation: each step,
+    outputs are disturbed by `follows` times the sensors' noise (p,), along the states that inputs reach, and
+    the drift by `drift` times the noise. Raises ValueError if the noise is no number above zero."""
     noise = np.broadcast_to(np.asarray(noise_degC, float), (model.p,)).copy()
     if not (np.isfinite(noise).all() and (noise > 0).all()):
         raise ValueError(
@@ -132,12 +133,14 @@ def supervision(
 
 
 def held_state(plant: Plant, likely: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """N (n, p) and x (n,) of the state N y + x, which inputs hold for long at outputs y (p,):
+    """Returns N (n, p) and x (n,) of the state N y + x, which inputs hold for long at outputs y (p,):
 
         x = A x + B u + b,  C x + d = y
 
-    so that what lies behind the sensors of a machine that is found warm, walls or a barrel, is warm too. What
-    no input holds, and a plant without a rest, is moved along `likely` (n, p), with C likely = I."""
+    Then the parts behind the sensors of a machine that is found warm, walls or a barrel, are warm too.
+    Directions that no input holds, and plants without a rest, are moved along `likely` (n, p), with C likely
+    = I.
+    """
     slow = np.eye(plant.n) - plant.A
     if np.linalg.cond(slow) > RESTLESS:
         return likely, -likely @ plant.d
@@ -152,8 +155,9 @@ PLANTS = 5  # one of each structure
 
 
 def play(exported: Exported, cases: panel.Cases) -> dict[str, Any]:
-    """How many of `cases` there are, in how many the law was left, the share of their samples that it was
-    left for, in percent, and the first reason of the first of them with its plant. A sample at a time."""
+    """Plays the controller sample by sample on some of `cases`. Returns their number, in how many the law
+    was left, for what percentage of samples, and the first reason, with its plant, in the first of those
+    cases."""
     cases = panel.some(cases, KINDS, PLANTS)
     made = exported.controller.forward
     running = [Supervised(exported, rehearsal=True) for _ in cases.plant]

@@ -1,10 +1,10 @@
-"""What a record leaves open: window models and gains learned again from resampled blocks of its samples, and
-what a controller does on those plants.
+"""Plants that a record does not exclude: window models and gains, learned again from resampled blocks of its
+samples, and how a controller performs on those plants.
 
-The regression of a window model (temperature/window.py) needs second moments only. Those of a block of
+The regression of a window model (temperature/window.py) needs second moments only. Those of each block of
 consecutive samples are summed once; a resample (Kuensch 1989) is then a sum of blocks and one solve, and each
-is a plant that the record does not contradict. Blocks keep what is not white: drift, and what no linear model
-has.
+is a plant that the record does not contradict. Blocks preserve errors that are not white: drift, and effects
+that no linear model has.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,14 +31,14 @@ from pipeline.temperature.plant import hold_output, observability_matrix, padded
 from pipeline.temperature.tracking import gains
 
 Segments = Sequence[np.ndarray]
-LEAST_BLOCKS = 20  # fewer blocks than this say little of how far a resample may lie
+LEAST_BLOCKS = 20  # with fewer blocks the scatter of resamples is not reliable
 DIVERGED = 1e6  # °C
 CHUNK = 50  # resamples whose moments are held at once
 
 
 class Rows(NamedTuple):
-    """The complete windows of a record, one a row: w (samples, N (m+p)), inputs u (samples, m), outputs y
-    (samples, p) of the same instant."""
+    """The complete windows of a record, one a row: `w` (samples, N (m+p)); inputs `u` (samples, m) and
+    outputs `y` (samples, p) of the same instant."""
 
     w: np.ndarray
     u: np.ndarray
@@ -48,7 +48,7 @@ class Rows(NamedTuple):
 
 class Moments(NamedTuple):
     """Second moments (blocks, k, k) of the columns [1, (w - centre) / scale, y - base] over each block of
-    `block` rows; `starts` (blocks,) are their first rows."""
+    `block` rows; `starts` (blocks,): their first rows."""
 
     blocks: np.ndarray
     starts: np.ndarray
@@ -59,8 +59,8 @@ class Moments(NamedTuple):
 
 
 class Predictors(NamedTuple):
-    """Window models, one a resample: Theta (count, p, N (m+p)), theta_0 (count, p), covariance of the
-    innovation (count, p, p)."""
+    """Window models, one for each resample: `Theta` (count, p, N (m+p)); `theta_0` (count, p); `covariance`
+    of the innovation (count, p, p)."""
 
     Theta: np.ndarray
     theta_0: np.ndarray
@@ -74,8 +74,8 @@ class Predictors(NamedTuple):
 
 
 class GainRoute(NamedTuple):
-    """How the gains were learned: by which route, from windows of N samples, with weights diag(q) (p,),
-    diag(r) (m,), the discount and the spread of input gains that window.learn allows for."""
+    """How the gains were learned: `route`; windows of `N` samples; weights diag(q) (p,) and diag(r) (m,);
+    `gamma`, the discount; `gain_spread`, the spread of input gains that window.learn allows for."""
 
     route: Literal["window", "kernel"]
     N: int
@@ -86,8 +86,8 @@ class GainRoute(NamedTuple):
 
 
 def gain_route(problem: DesignProblem, learned_from: str, values: Mapping[str, Any]) -> GainRoute | None:
-    """How the gains of a controller were learned from the record; None if they are those of a model. `values`
-    are its tuned parameters."""
+    """Returns how the gains of a controller were learned from the record; None if they come from a model.
+    `values`: its tuned parameters."""
     if learned_from != "window" and learned_from != "kernel":
         return None
     learned = problem.window if learned_from == "window" else problem.kernel
@@ -99,7 +99,7 @@ def gain_route(problem: DesignProblem, learned_from: str, values: Mapping[str, A
 
 class Bands(NamedTuple):
     """Gains u = -K w - K_r r of the record, and the ends of their bands at `level`: each (m, N (m+p) + p),
-    the columns of K before those of K_r, in percent per percent and percent per °C. `resamples` is how many
+    the columns of K before those of K_r, in percent per percent and percent per °C. `resamples`: how many
     gave a gain."""
 
     gain: np.ndarray
@@ -113,12 +113,13 @@ class Bands(NamedTuple):
 
 
 def rows(u: Segments, y: Segments, N: int) -> Rows:
-    """Raises ValueError where no segment is longer than N samples."""
+    """Returns the complete windows. Raises ValueError if no segment is longer than N samples."""
     return Rows(*windows(u, y, N), N)
 
 
 def moments(data: Rows, block: int) -> Moments:
-    """Blocks of `block` rows, shorter where the record has fewer than LEAST_BLOCKS of them."""
+    """Returns the moments of blocks of `block` rows; the blocks are shorter if the record has fewer than
+    LEAST_BLOCKS."""
     samples = len(data.w)
     block = max(min(block, samples // LEAST_BLOCKS), 1)
     starts = np.arange(0, samples, block)
@@ -130,13 +131,14 @@ def moments(data: Rows, block: int) -> Moments:
 
 
 def drawn(of: Moments, count: int, rng: np.random.Generator) -> np.ndarray:
-    """How often each block is taken (count, blocks), as many blocks as there are."""
+    """Returns how often each block is drawn (count, blocks); each resample has as many blocks as the
+    record."""
     blocks = len(of.starts)
     return rng.multinomial(blocks, np.full(blocks, 1 / blocks), size=count).astype(float)
 
 
 def predictors(of: Moments, taken: np.ndarray, data: Rows, *, gain_spread: float = 0.0) -> Predictors:
-    """One window model for each row of `taken` (count, blocks), by least squares with a constant."""
+    """Returns one window model for each row of `taken` (count, blocks), by least squares with a constant."""
     m, p = data.u.shape[1], data.y.shape[1]
     k = 1 + data.w.shape[1]
     Theta, theta_0 = np.empty((len(taken), p, k - 1)), np.empty((len(taken), p))
@@ -145,7 +147,7 @@ def predictors(of: Moments, taken: np.ndarray, data: Rows, *, gain_spread: float
         normal, right = S[:k, :k].copy(), S[:k, k:]
         if gain_spread:
             normal += gain_spread**2 * _own_moments(S, of, m, p, data.N)
-        normal[np.diag_indices(k)] *= 1 + 1e-10  # a signal that stands still in these blocks
+        normal[np.diag_indices(k)] *= 1 + 1e-10  # in case a signal is constant in these blocks
         solution = scipy.linalg.cho_solve(scipy.linalg.cho_factor(normal, lower=True), right)
         residual = S[k:, k:] - solution.T @ right - right.T @ solution + solution.T @ S[:k, :k] @ solution
         covariance[i] = residual / max(S[0, 0] - k, 1.0)
@@ -155,15 +157,15 @@ def predictors(of: Moments, taken: np.ndarray, data: Rows, *, gain_spread: float
 
 
 def _summed(of: Moments, taken: np.ndarray) -> Iterator[np.ndarray]:
-    """The moments (k, k) of each resample, CHUNK resamples a product."""
+    """Yields the moments (k, k) of each resample, CHUNK resamples in one product."""
     flat, shape = of.blocks.reshape(len(of.blocks), -1), of.blocks.shape[1:]
     for first in range(0, len(taken), CHUNK):
         yield from (taken[first : first + CHUNK] @ flat).reshape(-1, *shape)
 
 
 def _own_moments(S: np.ndarray, of: Moments, m: int, p: int, N: int) -> np.ndarray:
-    """Second moments of each input's own lags about zero, in the scaled columns, inputs apart from one
-    another; zero for all else."""
+    """Returns the second moments of each input's own lags about zero, in the scaled columns, without those
+    between inputs; zero for all other columns."""
     k = 1 + N * (m + p)
     own = np.zeros((k, k))
     ratio = of.centre / of.scale
@@ -188,12 +190,13 @@ def bands(
     block: int | None = None,
     rng: np.random.Generator,
 ) -> Bands:
-    """Bands of the learned gains by resampling blocks of the record, two windows long by itself.
+    """Returns bands of the learned gains, by resampling blocks of the record. `block`: rows in a block, by
+    default two windows.
 
-    2 K - mean +- z s of the resamples: bias-corrected, as the regression's bias shows in them once more
-    (Efron and Tibshirani 1993, 10.6), and by their deviation. Quantiles of the resamples held some gains in
-    54 % of records where 90 % were wanted, these in 82 %. Resamples that give no
-    gain are left out. Raises ValueError where fewer than half of them give one.
+    They are 2 K - mean +- z s of the resamples: bias-corrected, since the regression's bias appears in them
+    once more (Efron and Tibshirani 1993, 10.6), and with their standard deviation s. With quantiles of the
+    resamples, bands of 90 % contained some gains in only 54 % of records; these do in 82 %. Resamples without
+    a gain are left out. Raises ValueError if fewer than half of them give one.
     """
     data = rows(u, y, learning.N)
     of = moments(data, block or max(2 * learning.N, 10))
@@ -218,7 +221,7 @@ def bands(
 def _gain(
     data: Rows, of: Moments, counts: np.ndarray, learned: WindowModel, learning: GainRoute
 ) -> np.ndarray:
-    """[K K_r] (m, N (m+p) + p) of one resample, whose window model is `learned`."""
+    """Returns [K K_r] (m, N (m+p) + p) of one resample, whose window model is `learned`."""
     Q, R = np.diag(learning.q), np.diag(learning.r)
     if learning.route == "window":
         model, T = observer_form(learned)
@@ -229,8 +232,8 @@ def _gain(
 
 
 def _predicted(learned: WindowModel, data: Rows, of: Moments, counts: np.ndarray) -> Tuples:
-    """window.predicted_tuples of resampled rows: the state is what the window predicts of the next two
-    outputs, and the moments come from the blocks."""
+    """Returns window.predicted_tuples of resampled rows. The state is what the window predicts of the next
+    two outputs, and the moments come from the blocks."""
     m, p, width = data.u.shape[1], data.y.shape[1], data.w.shape[1]
     index = np.concatenate([np.repeat(a, int(c)) for a, c in enumerate(counts)])
     rows = (of.starts[index][:, None] + np.arange(of.block)).ravel()
@@ -265,8 +268,8 @@ def _predicted(learned: WindowModel, data: Rows, of: Moments, counts: np.ndarray
 
 
 class ReferenceSteps(NamedTuple):
-    """From rest at `start` (p,) °C the references (g, p) °C, `steps` each; an error is settled as the mean of
-    the last `settled` steps."""
+    """Starting at rest at `start` (p,) °C, the references (g, p) °C are applied for `steps` samples each. The
+    settled error is the mean error of the last `settled` samples."""
 
     references: np.ndarray
     start: np.ndarray
@@ -275,8 +278,8 @@ class ReferenceSteps(NamedTuple):
 
 
 class Met(NamedTuple):
-    """Of s plants: settled error (s,) in °C, the largest over references and outputs, DIVERGED where it does
-    not stay finite; lowest and highest outputs (s, p) in °C."""
+    """Results of s plants: `settled_error` (s,) in °C, the largest over references and outputs, DIVERGED if
+    it is not finite; `lowest` and `highest` outputs (s, p) in °C."""
 
     settled_error: np.ndarray
     lowest: np.ndarray
@@ -284,8 +287,8 @@ class Met(NamedTuple):
 
 
 class _Plants(NamedTuple):
-    """s plants: state x (s, n) and inputs u (s, m) at rest, outputs of a state, the state after inputs and
-    measured outputs, and a draw of the sensors' noise (s, p)."""
+    """s plants: state x (s, n) and inputs u (s, m) at rest; functions for the outputs of a state, the state
+    after inputs and measured outputs, and a random sample of the sensors' noise (s, p)."""
 
     x: np.ndarray
     u: np.ndarray
@@ -297,10 +300,15 @@ class _Plants(NamedTuple):
 def met(
     controller: Deployed, model: Plant, sampled: Predictors, asked: ReferenceSteps, rng: np.random.Generator
 ) -> Met:
-    """Window models under the controller as deployed, all at once, with innovations of their own covariance.
+    """Simulates window models with the controller as deployed, all at once, with innovations of their own
+    covariance.
 
-    In observer form (window.observer_form) x_i(t+1) = x_{i+1} + A_i y + B_i u, and what is measured drives
-    it. Each starts at rest by the input of least norm that holds it there, as near as limits allow.
+    In observer form (window.observer_form)
+
+        x_i(t+1) = x_{i+1} + A_i y + B_i u,
+
+    driven by the measured outputs. Each starts at rest with the input of least norm that holds it there, as
+    near as limits allow.
     """
     s, p, width = sampled.Theta.shape
     N = sampled.N
@@ -341,7 +349,7 @@ def met_spread(
     noise: np.ndarray,
     rng: np.random.Generator,
 ) -> Met:
-    """The same for plants of a spread, sensors with white noise (p,) °C."""
+    """Does the same for plants of a spread, with sensors of white noise (p,) °C."""
     held = [hold_output(plant, asked.start) for plant in spread]
     plants = padded(spread)
     A, B, C, b, d = (np.stack([getattr(plant, name) for plant in plants]) for name in "ABCbd")

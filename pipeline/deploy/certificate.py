@@ -1,9 +1,10 @@
-"""The certificate of a controller: what was measured of it, on which evidence, and whether it is exported.
+"""The certificate of a controller: what was measured, and on which evidence, and whether it is exported.
 
-This module is the document: the record that it rests on, its rules, their results, and its JSON. certify.py
-measures once, whatever is allowed; `decide` compares with the limits, in the declared order of RULES. Six
-rules compare with the settled error and the margins that section `report` declares: a changed limit measures
-nothing again. The first rule that fails refuses the controller. The evidence is "recorded" or "simulated".
+This module is the document: the record on which it is based, its rules, their results, and its JSON.
+certify.py measures once, independent of the limits; `decide` compares with the limits, in the declared order
+of RULES. Six rules use the settled error and the margins that section `report` declares, so a changed limit
+needs no new measurement. The first rule that fails refuses the controller. The evidence is "recorded" or
+"simulated".
 """
 
 import hashlib
@@ -22,8 +23,8 @@ Segments = Sequence[np.ndarray]
 
 
 class EvidenceRecord(NamedTuple):
-    """What a certificate rests on: the signals as they were recorded, and segments without gaps. The newest
-    segments come from the machine as it is today, with the wiring that the controller will have."""
+    """The record on which a certificate is based: the signals as recorded, and segments without gaps. The
+    newest segments come from the machine as it is today, with the wiring that the controller will have."""
 
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
@@ -35,8 +36,8 @@ class EvidenceRecord(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """How a controller is measured, and the limits that no params file changes. From rest at `start` each of
-    `references` is held for `steps` samples."""
+    """How a controller is measured, and the limits that no params file changes. Starting at rest at `start`,
+    each of `references` is applied for `steps` samples."""
 
     references: np.ndarray  # (g, p) °C
     start: np.ndarray  # (p,) °C
@@ -52,18 +53,19 @@ class Rules(NamedTuple):
     samples: float = 5.0  # for each unknown of a window model
     moves: float = 0.002  # least share of an input's range that it moves by itself
     ahead: int = 20
-    # share of the newest record's movement over `ahead` samples that the model may miss beyond what the
+    # fraction of the newest record's movement over `ahead` samples that the model may miss, beyond what the
     # record's own window model misses
     unexplained: float = 0.5
     noise: float = 0.3  # deviation of a settled mean as a share of the settled error's limit
-    # what the record's window models may extrapolate to at rest without inputs: a room, wider by the error of
-    # a straight line from hot to cold
+    # temperatures at rest without inputs to which the record's window models may extrapolate: those of a
+    # room, widened by the error of a straight line from hot to cold
     extrapolated_degC: tuple[float, float] = (-50.0, 110.0)
     reach: float = 0.5  # of the recorded span, by which references may lie beyond it
 
 
 class RuleResult(NamedTuple):
-    """One rule: the figure, the limit, and a sentence. `asked` is False if an earlier rule refused."""
+    """Result of one rule: the figure, the limit, and a sentence. `asked` is False if an earlier rule
+    refused."""
 
     name: str
     passed: bool
@@ -75,15 +77,15 @@ class RuleResult(NamedTuple):
 
 
 class Certificate(NamedTuple):
-    """What was shown of a controller. Fields that no rule came to are empty or None.
+    """What was measured of a controller. Fields of rules that were not reached are empty or None.
 
     `poles`, of each closed loop: {"of": "model", "spread", "record" or "newest", "radius", "poles": the
-    largest, [real, imaginary]}. `margins` of family and record, median, the one that nine of ten reach, and
-    least: {"plants", "disk", "delay_s"}, None without end. `worst`, settled errors in °C of sampled plants,
-    median, 99 % quantile and worst: {"plants", "settled_error_degC", "failing", "diverged"}. `violations`, by
-    how many °C plants cross a limit: {"output", "worst_degC", "plants": how many do by more than allowed}.
-    `bands` of learned gains u = -K w - K_r r: {"level", "resamples", "on": a signal so many samples before,
-    or a reference, "gain", "low", "high": rows by input}.
+    largest, [real, imaginary]}. `margins` of family and record, as [median, the one that nine of ten reach,
+    least]: {"plants", "disk", "delay_s"}, None if unlimited. `worst`, settled errors in °C of sampled plants,
+    as [median, 99 % quantile, worst]: {"plants", "settled_error_degC", "failing", "diverged"}. `violations`,
+    by how many °C plants cross a limit: {"output", "worst_degC", "plants": number of plants above the
+    allowed}. `bands` of learned gains u = -K w - K_r r: {"level", "resamples", "on": a signal so many samples
+    before, or a reference, "gain", "low", "high": rows by input}.
     """
 
     version: int
@@ -147,7 +149,7 @@ def result(
 
 
 def _finite(value: float | None) -> float | None:
-    """JSON knows no infinity."""
+    """Returns None for infinity, which JSON does not have."""
     return None if value is None or not np.isfinite(value) else float(value)
 
 
@@ -155,19 +157,20 @@ def _finite(value: float | None) -> float | None:
 
 
 def to_json(certificate: Certificate) -> str:
-    """Canonical JSON: sorted keys, no blanks; limits that are not declared are null."""
+    """Returns canonical JSON: sorted keys, no blanks; limits that are not declared are null."""
     return json.dumps(
         plain(certificate), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
     )
 
 
 def sha256(certificate: Certificate) -> str:
-    """Of the canonical JSON."""
+    """Returns the SHA-256 of the canonical JSON."""
     return hashlib.sha256(to_json(certificate).encode()).hexdigest()
 
 
 def from_json(text: str) -> Certificate:
-    """Raises ValueError where the text is no certificate of this version, saying what is missing."""
+    """Returns the certificate. Raises ValueError, naming what is missing, if the text is no certificate of
+    this version."""
     try:
         about = json.loads(text)
     except ValueError as error:
@@ -189,7 +192,8 @@ def from_json(text: str) -> Certificate:
 
 
 def _check(certificate: Certificate) -> None:
-    """Raises ValueError if the verdict is not that of the rules, or the rules are of another version."""
+    """Raises ValueError if the verdict does not follow from the rules, or if the rules belong to another
+    version."""
     first = next((one.name for one in certificate.rules if not one.passed), None)
     if certificate.first_failed != first or certificate.verdict != ("refused" if first else "passed"):
         raise ValueError(f"its verdict {certificate.verdict} is not that of its rules")
@@ -198,7 +202,7 @@ def _check(certificate: Certificate) -> None:
 
 
 def rebuilt(about: dict[str, Any]) -> Certificate:
-    """The certificate of a JSON object."""
+    """Returns the certificate of a JSON object."""
     made: dict[str, Any] = {name: about[name] for name in Certificate._fields}
     made |= {name: tuple(about[name]) for name in ("samples", "poles", "violations")}
     made |= {side: tuple(map(signal, about[side])) for side in ("inputs", "outputs")}
@@ -207,7 +211,7 @@ def rebuilt(about: dict[str, Any]) -> Certificate:
 
 
 def plain(value: Any) -> Any:
-    """Values as JSON has them; numbers that are not finite are null."""
+    """Returns values as JSON types; numbers that are not finite are null."""
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
         return {name: plain(part) for name, part in value._asdict().items()}
     if isinstance(value, dict):
@@ -222,14 +226,14 @@ def plain(value: Any) -> Any:
 # ---- compared with the limits
 
 MEASURED, CERTIFIED = "measured.json", "certified.json"
-# stands in the exported files for the SHA-256 of the certificate, which depends on the limits
+# placeholder in the exported files for the SHA-256 of the certificate, which depends on the limits
 PLACE = "@certificate@"
-# signals, samples, evidence, loop: the rules of a group are all asked if every group before it passed
+# signals, samples, evidence, loop: all rules of a group are evaluated if every group before it passed
 GROUPS = (RULES[:4], RULES[4:7], RULES[7:12], RULES[12:])
 
 
 class MeasuredController(NamedTuple):
-    """A certificate before its limits: `draft` holds the rules that no limit of section `report` enters, and
+    """A certificate before its limits. `draft` holds the rules that use no limit of section `report`;
     `figures`, by rule, what the other rules compare."""
 
     draft: Certificate
@@ -239,8 +243,8 @@ class MeasuredController(NamedTuple):
 def decide(
     measured: MeasuredController, *, settled_error_degC: float, disk_margin: float, delay_margin_s: float
 ) -> Certificate:
-    """The certificate under these limits, as section `report` declares them. The first rule that fails, in
-    the order of RULES, refuses the controller; rules of later groups are not asked."""
+    """Returns the certificate under these limits, as section `report` declares them. The first rule that
+    fails, in the order of RULES, refuses the controller; rules of later groups are not evaluated."""
     draft, figures = measured
     rules: dict[str, Callable[[Any], RuleResult]] = {
         "noise": lambda f: _of_noise(f, settled_error_degC),
@@ -288,7 +292,7 @@ def _of_noise(figures: Mapping[str, Any], limit_degC: float) -> RuleResult:
 
 
 def _of_colour(figures: Mapping[str, Any], limit_degC: float) -> RuleResult:
-    """Errors of one step may be predictable by no more than the settled error that is allowed."""
+    """Checks that no more than the allowed settled error of the one-step errors is predictable."""
     degC = _number(figures["degC"])
     return at_most(
         "coloured",
@@ -314,8 +318,8 @@ def _of_newest(figures: Mapping[str, Any], limit_degC: float) -> RuleResult:
 
 
 def _of_margin(name: str, figures: Mapping[str, Any], limit: float) -> RuleResult:
-    """`limit` for the 10 % plant, which nine plants in ten reach, and a share of it on the newest record; a
-    margin without end is None. The sentence names the figure that is furthest below its limit."""
+    """Checks `limit` for the 10 % plant, which nine plants in ten reach, and a fraction of it on the newest
+    record. A margin without limit is None. The sentence names the figure that is furthest below its limit."""
     unit = {"disk_margin": "1", "delay_margin": "s"}[name]
     margins = [_number(one) for one in figures["margins"][1:]]
     limits = [limit, figures["tail"] * limit]
@@ -350,7 +354,7 @@ def _of_settled_error(figures: Mapping[str, Any], limit_degC: float) -> RuleResu
 
 
 def _number(value: float | None) -> float:
-    """JSON knows no infinity: null is a figure without end."""
+    """Returns infinity for null, since JSON has no infinity."""
     return np.inf if value is None else value
 
 
@@ -358,7 +362,7 @@ def _number(value: float | None) -> float:
 
 
 def write(folder: Path, measured: MeasuredController) -> None:
-    """measured.json of a controller's folder."""
+    """Writes measured.json of a controller's folder."""
     artifacts.write_json(folder / MEASURED, plain(measured))
 
 
@@ -368,15 +372,15 @@ def read(folder: Path) -> MeasuredController:
 
 
 def fill(path: Path, certificate_sha256: str) -> str:
-    """The text of a prepared file with the SHA-256 in its marked place."""
+    """Returns the text of a prepared file with the SHA-256 inserted in its marked place."""
     return path.read_text(encoding="utf-8").replace(PLACE, certificate_sha256)
 
 
 def results(
     folder: str | Path, *, settled_error_degC: float, disk_margin: float, delay_margin_s: float
 ) -> dict[str, dict[str, Any]]:
-    """By controller of the temperature loop, whether its certificate is passed under these limits, and why
-    not. Empty if certify did not run."""
+    """Returns, by controller of the temperature loop, whether its certificate is passed under these limits,
+    and why not. Empty if certify did not run."""
     folder = Path(folder)
     if not artifacts.exists(folder / CERTIFIED):
         return {}
@@ -396,7 +400,7 @@ def results(
 
 
 def refusal(certificate: Certificate) -> str:
-    """Why the controller is refused; empty if the certificate is passed."""
+    """Returns why the controller is refused; "" if the certificate is passed."""
     rule = next((one for one in certificate.rules if one.name == certificate.first_failed), None)
     if rule is None:
         return ""

@@ -1,14 +1,14 @@
-"""Measure a controller on its record, for its certificate. Three questions, in the declared order of
-certificate.RULES: is the record of this machine, does the evidence hold, and would the controller work?
-certificate.py compares with what is allowed afterwards.
+"""Measures a controller on its record, for its certificate. There are three questions, in the declared order
+of certificate.RULES: is the record of this machine, is the evidence sufficient, and would the controller
+work? certificate.py then compares the results with the limits.
 
-Evidence: names, units, sample time and limits of the record are the machine's. It has samples enough, inputs
-that move by themselves, and references where it was taken. The model that the controller was made on must
-explain its newest part.
+Evidence: names, units, sample time and limits of the record must be the machine's. The record needs enough
+samples, inputs that move independently, and references within its range. The controller's model must explain
+its newest part.
 
 Loop: poles and margins over the model, its spread, and window models of resampled blocks of the record
-(bands.py); the same on those of its newest part alone, the machine as it is now; and the worst of at least
-1,000 sampled plants, which the controller meets as deployed.
+(bands.py); the same for the newest part alone, the machine as it is now; and the worst of at least 1,000
+sampled plants with the controller as deployed.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ from pipeline.temperature.plant import strictly_proper
 from pipeline.temperature.test_set import panel, scorecard
 from pipeline.temperature.tracking import robust_observer_gain
 
-NEWEST = 0.25  # of a single recording: its end stands for the machine as it is today
-SHORTEST = 100  # samples of a piece between two missing ones, below which it shows nothing of its own
+NEWEST = 0.25  # fraction at the end of a single recording that represents the machine as it is today
+SHORTEST = 100  # least samples of a piece between two missing ones
 REACH = 0.25  # of the recorded span, beyond which no reference is certified
 COOLEST = 0.05  # quantile of the recorded temperatures
 
@@ -51,8 +51,8 @@ COOLEST = 0.05  # quantile of the recorded temperatures
 def cut_at_missing(
     u: Sequence[np.ndarray], y: Sequence[np.ndarray], recordings: Sequence[int]
 ) -> tuple[list[np.ndarray], list[np.ndarray], list[int]]:
-    """The pieces (T, m), (T, p) and the recording of each, cut where a sample of an output is missing (NaN);
-    pieces shorter than SHORTEST samples are left out."""
+    """Returns the pieces (T, m), (T, p) and the recording of each, cut where a sample of an output is missing
+    (NaN). Pieces shorter than SHORTEST samples are left out."""
     parts = [
         (inputs[run], outputs[run], number)
         for inputs, outputs, number in zip(u, y, recordings, strict=True)
@@ -65,9 +65,9 @@ def cut_at_missing(
 def split_newest(
     u: Sequence[np.ndarray], y: Sequence[np.ndarray], recordings: Sequence[int]
 ) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
-    """u, y, newest u, newest y of pieces (T, m), (T, p) without a missing sample and the recording of each.
-    The newest are the pieces of the last recording, or the last quarter of the longest piece of a single
-    one."""
+    """Returns u, y, newest u, newest y. Takes pieces (T, m), (T, p) without missing samples, and the
+    recording of each. The newest pieces are those of the last recording; if there is only one, the last
+    quarter of its longest piece."""
     pieces, new = list(zip(u, y, strict=True)), [number == recordings[-1] for number in recordings]
     if all(new):
         longest = max(range(len(pieces)), key=lambda i: len(pieces[i][0]))
@@ -82,8 +82,8 @@ def split_newest(
 
 
 def require(half: panel.Cases, record: EvidenceRecord, settled: int, plants: int, resamples: int) -> Rules:
-    """How each controller is measured: on the constant references of the judging half that the record
-    reaches, from where the record is coolest. References further off were simulated only. If the record
+    """Returns how each controller is measured: on the constant references of the judging half that the record
+    reaches, starting where the record is coolest. References further away were only simulated. If the record
     reaches none, all are taken, and the certificate is refused."""
     constants = sorted({int(half.asked[row, 0]) for row in np.flatnonzero(half.kind == "constant")})
     references = np.array([half.references[index].H[:, 0] for index in constants])
@@ -112,12 +112,12 @@ def measure(
     delay_share: float = 1.0,
     conditions: str = "",
 ) -> MeasuredController:
-    """What the certificate of a controller says before its limits are known.
+    """Returns what the certificate of a controller states before its limits are known.
 
-    `family` is the spread of the identified plant, `models` what window_models drew from
-    the record with `rng`, which is copied. `learning` says how gains were learned from the record; then bands
-    of them are measured. `delay_share` of a declared delay margin is required of this machine. `conditions`
-    is the certificate's sentence.
+    `family`: spread of the identified plant; `models`: what window_models drew from the record with `rng`,
+    which is copied; `learning`: how gains were learned from the record, and if given, bands of them are
+    measured; `delay_share`: fraction of a declared delay margin that is required of this machine;
+    `conditions`: the certificate's sentence.
     """
     rng = copy.deepcopy(rng)
     results = of_signals(exported, record, rules)
@@ -174,8 +174,8 @@ def _draft(exported: Exported, record: EvidenceRecord) -> Certificate:
 
 # ---- is the record of this machine?
 
-LAGS = 5  # of errors and inputs from which a coloured error could have been foretold
-# share of the largest command that is allowed: a record that never leaves it is in another unit (0..1)
+LAGS = 5  # of errors and inputs from which a coloured error could have been predicted
+# fraction of the largest allowed command; a record that never exceeds it is in another unit (0..1)
 SCALE = 0.015
 
 
@@ -223,7 +223,8 @@ def of_signals(exported: Exported, record: EvidenceRecord, rules: Rules) -> list
 
 
 def _of_limits(exported: Exported, record: EvidenceRecord) -> RuleResult:
-    """Whether recorded inputs lie within the limits of the command, and are no share of them."""
+    """Checks that recorded inputs lie within the limits of the command, and that they are not fractions of
+    1."""
     rows, inputs = np.vstack([*record.u, *record.newest_u]), exported.machine.inputs
     low, high = np.array([(one.low, one.high) for one in inputs]).T
     span = high - low
@@ -251,9 +252,9 @@ def _of_limits(exported: Exported, record: EvidenceRecord) -> RuleResult:
 
 
 class WindowModels(NamedTuple):
-    """What the record itself shows, the same for every controller: window models of the whole record, one a
-    resample, and of its newest part alone (None if the record has too few samples); results of the rules
-    that no limit enters; and noise (p,) in °C one step ahead."""
+    """Results of the record itself, the same for every controller: window models of the whole record, one for
+    each resample, and of its newest part alone (None if the record has too few samples); results of the rules
+    that use no limit of section `report`; and noise (p,) in °C one step ahead."""
 
     of_record: bands.Predictors | None
     of_newest: bands.Predictors | None
@@ -264,8 +265,8 @@ class WindowModels(NamedTuple):
 def window_models(
     machine: Machine, record: EvidenceRecord, rules: Rules, rng: np.random.Generator
 ) -> WindowModels:
-    """The models and the rules samples, excitation, reach and room. Raises ValueError if the arrays of the
-    record do not have the machine's number of signals."""
+    """Returns the models, and the results of the rules samples, excitation, reach and room. Raises ValueError
+    if the arrays of the record do not have the machine's number of signals."""
     _check(machine, record, rules)
     with np.errstate(all="ignore"):  # what diverges is a finding
         return _window_models(machine, record, rules, rng)
@@ -332,13 +333,15 @@ def _check(machine: Machine, record: EvidenceRecord, rules: Rules) -> None:
 
 
 def _levelled(learned: Segments, newest: Segments) -> list[np.ndarray]:
-    """The learned segments about the mean of the newest: a constant for each in every regression
-    (Frisch-Waugh). With one for both, a room that differs between them looks like an integrator."""
+    """Returns the learned segments, shifted to the mean of the newest ones. This gives each its own constant
+    in every regression (Frisch-Waugh). With one constant for both, a change of room temperature would look
+    like an integrator."""
     return [part - np.vstack(learned).mean(axis=0) + np.vstack(newest).mean(axis=0) for part in learned]
 
 
 def _longest(u: Segments, y: Segments, rules: Rules) -> int:
-    """The longest window for which there are `rules.samples` for each unknown."""
+    """Returns the longest window with at least `rules.samples` samples for each unknown; 0 if there is
+    none."""
     m, p = u[0].shape[1], y[0].shape[1]
     for N in range(rules.longest_window, 0, -1):
         if sum(max(len(a) - N, 0) for a in u) >= rules.samples * (1 + N * (m + p)):
@@ -353,8 +356,8 @@ def _too_few(samples: int, u: Segments, y: Segments, rules: Rules) -> RuleResult
 
 
 def _of_excitation(machine: Machine, record: EvidenceRecord, N: int, rules: Rules) -> RuleResult:
-    """The part of each input that no past and no other input foretells, in the learned record and in the
-    newest, as a share of its range."""
+    """Checks the part of each input that neither the past nor other inputs predict, in the learned record and
+    in the newest, as a fraction of its range."""
     inputs = machine.inputs
     span = np.array([one.high - one.low for one in inputs])
     least = np.full(len(inputs), np.inf)
@@ -374,8 +377,9 @@ def _of_excitation(machine: Machine, record: EvidenceRecord, N: int, rules: Rule
 
 
 def _own_moves(u: Segments, y: Segments, N: int) -> np.ndarray:
-    """Deviation (m,) of what the window, the outputs now and the other inputs do not foretell of each input:
-    what a controller makes of its measurements tells nothing of the plant."""
+    """Returns the standard deviation (m,) of the part of each input that the window, the present outputs and
+    the other inputs do not predict. The part that a controller derives from its measurements shows nothing of
+    the plant."""
     try:
         data = bands.rows(u, y, N)
     except ValueError:
@@ -409,7 +413,7 @@ def _of_reach(machine: Machine, record: EvidenceRecord, rules: Rules) -> RuleRes
 
 
 def _of_room(sampled: bands.Predictors, outputs: Sequence[str], rules: Rules) -> RuleResult:
-    """A cold machine is as warm as its room. A reading in °F or K is not."""
+    """Checks that the cold machine is at a possible room temperature. A reading in °F or K is not."""
     (low, high), (coldest, hottest) = _extrapolated(sampled, len(outputs)), rules.extrapolated_degC
     off = np.maximum(low - hottest, coldest - high)
     said = "With its inputs off, drawn out from where it was"
@@ -426,7 +430,7 @@ def _of_room(sampled: bands.Predictors, outputs: Sequence[str], rules: Rules) ->
 
 
 def _extrapolated(sampled: bands.Predictors, p: int) -> tuple[np.ndarray, np.ndarray]:
-    """The band of 95 % (p,) of the outputs at rest without inputs, over the window models."""
+    """Returns the 95 % band (p,) of the outputs at rest without inputs, over the window models."""
     N = sampled.N
     m = sampled.Theta.shape[2] // N - p
     of_y = sampled.Theta[:, :, N * m :].reshape(len(sampled.Theta), p, N, p).sum(axis=2)
@@ -440,8 +444,8 @@ def _extrapolated(sampled: bands.Predictors, p: int) -> tuple[np.ndarray, np.nda
 def of_newest(
     exported: Exported, record: EvidenceRecord, own: bands.Predictors, rules: Rules
 ) -> tuple[RuleResult, dict[str, dict[str, Any]]]:
-    """The newest record compared with the model, beside its own window model: the rule unexplained; and the
-    figures of the rules coloured and newest."""
+    """Compares the model with the newest record, next to that record's own window model. Returns the result
+    of the rule unexplained, and the figures of the rules coloured and newest."""
     outputs, model = [one.name for one in exported.machine.outputs], _following(exported.model)
     u, y = record.newest_u, record.newest_y
     missed = _unexplained(model, own, u, y, rules.ahead)
@@ -464,21 +468,23 @@ def of_newest(
 
 
 def no_newest(record: EvidenceRecord, rules: Rules) -> RuleResult:
-    """The rule unexplained, refused because the newest record is too short for a window model of its own."""
+    """Returns the rule unexplained, refused because the newest record is too short for a window model of its
+    own."""
     samples = sum(map(len, record.newest_u))
     bad = f"The newest record has {samples} samples, too few to hold the model against it."
     return result("unexplained", False, None, rules.unexplained, "", "", bad)
 
 
 def _settled_on_newest(exported: Exported, own: bands.Predictors, rules: Rules) -> float:
-    """Settled error in °C of the controller on the window model of the newest record alone, without noise."""
+    """Returns the settled error in °C of the controller on the window model of the newest record alone,
+    without noise."""
     quiet = own._replace(covariance=np.zeros_like(own.covariance))
     steps, rng = reference_steps(rules), np.random.default_rng(0)
     return float(bands.met(exported.controller, exported.model, quiet, steps, rng).settled_error[0])
 
 
 def _following(model: Plant) -> Plant:
-    """The model with a gain that follows its outputs: its own, or one that is stable where its own is not."""
+    """Returns the model with a stable observer gain: its own, or a robust one if its own is not stable."""
     model = strictly_proper(model)
     if np.abs(np.linalg.eigvals(model.A - model.K @ model.C)).max() < 1:
         return model
@@ -486,7 +492,7 @@ def _following(model: Plant) -> Plant:
 
 
 def _own_model(u: Segments, y: Segments, N: int, ahead: int) -> bands.Predictors | None:
-    """The window model of these segments alone; None where they are too short."""
+    """Returns the window model of these segments alone; None if they are too short."""
     if N < 1 or not any(len(a) > 4 * ahead for a in u):
         return None
     data = bands.rows(u, y, N)
@@ -495,8 +501,8 @@ def _own_model(u: Segments, y: Segments, N: int, ahead: int) -> bands.Predictors
 
 
 def _unexplained(model: Plant, own: bands.Predictors, u: Segments, y: Segments, ahead: int) -> np.ndarray:
-    """Share (p,) of the outputs' movement over `ahead` steps that the model misses beyond what a window model
-    of the same segments misses."""
+    """Returns the fraction (p,) of the outputs' movement over `ahead` steps that the model misses, beyond
+    what a window model of the same segments misses."""
     of_own = predictor(own.window(0), model.sample_time_s)
     squares, first = np.zeros((3, y[0].shape[1])), 2 * ahead
     count, N = 0, own.N
@@ -506,7 +512,7 @@ def _unexplained(model: Plant, own: bands.Predictors, u: Segments, y: Segments, 
         errors = [b - _bounded(predicted_ahead(plant, a, b, ahead)) for plant in (model, of_own)]
         moved = b[ahead:] - b[:-ahead]
         for k, part in enumerate((errors[0][first:], errors[1][first:], moved[first - ahead :])):
-            # about the mean: another room is not another plant
+            # about the mean: another room temperature is not another plant
             squares[k] += len(part) * part.var(axis=0)
         count += len(b) - first
     by_model, by_own, moved = squares / count
@@ -519,8 +525,8 @@ def _bounded(predicted: np.ndarray) -> np.ndarray:
 
 
 def _foretold(model: Plant, u: Segments, y: Segments) -> np.ndarray:
-    """Deviation (p,) in °C of the part of one-step errors that errors and inputs of the LAGS samples before
-    foretell, less what as many numbers foretell by chance."""
+    """Returns the standard deviation (p,) in °C of the part of the one-step errors that errors and inputs of
+    the LAGS samples before predict, minus what as many parameters predict by chance."""
     errors = [_bounded(part) for part in one_step_errors(model, u, y)]
     inputs = [a - a.mean(axis=0) for a in u]
     keep = [k for k, part in enumerate(errors) if len(part) > 2 * LAGS]
@@ -535,7 +541,7 @@ def _foretold(model: Plant, u: Segments, y: Segments) -> np.ndarray:
 
 
 def reference_steps(rules: Rules) -> bands.ReferenceSteps:
-    """What sampled plants are asked for."""
+    """Returns the reference steps that sampled plants must follow."""
     return bands.ReferenceSteps(
         np.asarray(rules.references, float), np.asarray(rules.start, float), rules.steps, rules.settled
     )
@@ -554,8 +560,8 @@ def of_loop(
     rules: Rules,
     rng: np.random.Generator,
 ) -> tuple[dict[str, Any], list[RuleResult], dict[str, dict[str, Any]]]:
-    """Fields of the certificate; results of the rules poles and violations; and the figures of the rules
-    disk_margin, delay_margin and settled_error."""
+    """Returns fields of the certificate; results of the rules poles and violations; and the figures of the
+    rules disk_margin, delay_margin and settled_error."""
     at = exported.machine.sample_time_s
     some = range(min(rules.poles_of, len(of_record.Theta)))
     plants = [("model", strictly_proper(exported.model))]
@@ -598,8 +604,9 @@ def _poles(of: str, plant: Plant, controller: Deployed) -> dict[str, Any]:
 
 
 def _of_poles(poles: Sequence[dict[str, Any]], rules: Rules) -> RuleResult:
-    """All of model and spread within the unit circle, and of the plants of the record and its newest part all
-    but a share `rules.failing`: a resample's slowest pole may lie outside by chance."""
+    """Checks that all poles of model and spread lie within the unit circle. Of the plants of the record and
+    its newest part a fraction `rules.failing` may fail, because a resample's slowest pole may lie outside by
+    chance."""
     declared = [one for one in poles if one["of"] in ("model", "spread")]
     sampled = [one for one in poles if one["of"] in ("record", "newest")]
     outside = [sum(one["radius"] >= 1 for one in part) for part in (declared, sampled)]
@@ -649,8 +656,8 @@ def _settled_and_crossing(
     rules: Rules,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Settled errors (s,) in °C of the sampled plants and of the spread under the controller as deployed, and
-    by how many °C each crosses limits (s, p)."""
+    """Returns settled errors (s,) in °C of the sampled plants and of the spread with the controller as
+    deployed, and by how many °C each crosses limits (s, p)."""
     low, high = np.array([(one.low, one.high) for one in exported.machine.outputs]).T
     steps = reference_steps(rules)
     parts = [bands.met(exported.controller, exported.model, sampled, steps, rng)]
@@ -665,7 +672,8 @@ def _settled_and_crossing(
 
 
 def _worst(settled: np.ndarray) -> dict[str, Any]:
-    """How many plants fail is decided by the limit (certificate.decide): 0 until then."""
+    """Returns quantiles of the settled errors. The number of failing plants depends on the limit
+    (certificate.decide) and is 0 until then."""
     figures = [float(np.quantile(settled, share, method="higher")) for share in (0.5, 0.99, 1.0)]
     diverged = int((settled >= bands.DIVERGED).sum())
     return {"plants": len(settled), "settled_error_degC": figures, "failing": 0, "diverged": diverged}

@@ -1,6 +1,5 @@
-"""What is exported is what was judged: the rebuilt controller against the judged commands, the Python file
-against the object, the compiled C against its golden vectors.
-"""
+"""Checks that what is exported is what was judged: the rebuilt controller against the judged commands, the
+Python file against the object, the compiled C against its golden vectors."""
 
 import shutil
 import subprocess
@@ -16,25 +15,25 @@ from pipeline.deploy.supervise import DEGC, PERCENT, Exported, Supervised
 from pipeline.temperature.controllers.law import RunningController, all_fed_forward
 from pipeline.temperature.test_set import panel
 
-SAME = 1e-9  # of an input's range, by which commands in another order of sums may differ
+SAME = 1e-9  # of an input's range: allowed difference if sums are computed in another order
 COMPILERS = ("cc", "gcc", "clang")
 
 
 def judged_difference(
     made: Exported, cases: panel.Cases, case: int, outputs: np.ndarray, applied: np.ndarray
 ) -> float:
-    """The largest difference in percent between the commands of `made`, a sample at a time, and the commands
-    `applied` (steps, m) that the judged controller gave in that case, on the same outputs (steps, p)."""
+    """Returns the largest difference in percent between the commands of `made`, sample by sample, and the
+    commands `applied` (steps, m) of the judged controller in that case, for the same outputs (steps, p)."""
     return float(np.abs(commands(made, cases, case, outputs, applied) - applied).max())
 
 
 def commands(
     made: Exported, cases: panel.Cases, case: int, outputs: np.ndarray, applied: np.ndarray
 ) -> np.ndarray:
-    """Commands (steps, m) of the law, a sample at a time, in one case of a test set whose true outputs were
-    `outputs` (steps, p) under inputs `applied` (steps, m). The law remembers those, not its own commands: an
-    output limiter at work makes a difference of rounding grow sample by sample until it is as large as the
-    limits."""
+    """Returns commands (steps, m) of the law, sample by sample, in one case of a test set with true outputs
+    `outputs` (steps, p) and inputs `applied` (steps, m). The law remembers those inputs, not its own
+    commands. Otherwise an active output limiter would amplify a rounding difference sample by sample, until
+    it is as large as the limits."""
     running, held = RunningController(made.controller, made.model), panel.held_readings(cases)[:, case]
     u, first = cases.u0[case], cases.references[cases.asked[case, 0]]
     noise, step_degC = panel.noise_of(cases)[cases.hold :, case], cases.structure[cases.plant[case], 4]
@@ -53,7 +52,7 @@ def commands(
 
 
 def forward_of(made: Exported, cases: panel.Cases, case: int) -> np.ndarray:
-    """What is fed forward (steps, m) in one case."""
+    """Returns what is fed forward (steps, m) in one case."""
     usual = 0.0 if made.controller.forward is None else made.controller.forward.mean
     return all_fed_forward(made.controller, cases.told[:, case] + usual)
 
@@ -70,8 +69,8 @@ def check_same(made: Exported, difference: float) -> None:
 
 
 def python_difference(made: Exported, code: str) -> float:
-    """The largest difference in percent between the exported file, run as it stands, and the object, over the
-    samples of a script with limits, faults and hand-overs."""
+    """Returns the largest difference in percent between the exported file, run as it is, and the object, over
+    the samples of a script with limits, faults and hand-overs."""
     module: dict[str, Any] = {"__name__": "exported"}
     exec(compile(code, "exported.py", "exec"), module)
     script = vectors.script(made, episodes=2, steps=160, rng=np.random.default_rng(2))
@@ -89,12 +88,12 @@ def python_difference(made: Exported, code: str) -> float:
 
 
 def find_compiler() -> str | None:
-    """The name of a C compiler of this machine, if it has make too."""
+    """Returns the name of a C compiler on this computer, if make is installed too; else None."""
     return next((name for name in COMPILERS if shutil.which(name) and shutil.which("make")), None)
 
 
 def check_compiled(made: Exported, files: Mapping[str, str]) -> None:
-    """Compiles the exported C and plays golden.csv, if this machine has a compiler and make. Raises
+    """Compiles the exported C and plays golden.csv, if this computer has a compiler and make. Raises
     ValueError if it does not compile, or gives other commands."""
     compiler = find_compiler()
     if compiler is None:
@@ -102,7 +101,7 @@ def check_compiled(made: Exported, files: Mapping[str, str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name, text in files.items():
             (Path(folder) / name).write_text(text, encoding="utf-8")
-        # without -Werror: a warning of some compiler is no fault of the controller
+        # without -Werror: a compiler's warning is no fault of the controller
         command = ["make", "-s", "test", f"CC={compiler}", "STRICT=-std=c99", "CFLAGS=-O0"]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
     if done.returncode:

@@ -1,8 +1,9 @@
-"""The Bayes filter of the flow with numpy alone: each window moves the belief, and the move of least
-expected loss follows. Reads filter.safetensors with flow_reader.read_safetensors. Letters as in the project's
-flow_filter.py.
+"""The Bayes filter of the flow with numpy alone: each window updates the belief, and the move of least
+expected loss follows. Reads filter.safetensors with flow_reader.read_safetensors. Letters are as in the
+project's flow_filter.py.
 
-Held windows, waits and limits of what is sent are not in it."""
+Not included: when nothing may be sent, waits, and limits of what is sent.
+"""
 
 import math
 
@@ -10,13 +11,14 @@ import numpy as np
 
 
 def start(f):
-    """The belief (G, Z, N) before the first window."""
+    """Returns the belief (G, Z, N) before the first window."""
     prior = f["weight"][:, None] * f["prior"] / len(f["gains"])
     return np.tile(np.asarray(prior, float), (len(f["gains"]), 1, 1))
 
 
 def shifted(f, belief, move):
-    """The belief (Z, N) moved by `move` percent, linear between grid points; nothing leaves the grid."""
+    """Returns the belief (Z, N) moved by `move` percent, linear between grid points; nothing leaves the
+    grid."""
     grid, after = f["grid"], np.zeros(belief.shape)
     at = np.clip((grid + move - grid[0]) / (grid[1] - grid[0]), 0, len(grid) - 1)
     low = np.minimum(np.floor(at).astype(int), len(grid) - 2)
@@ -27,7 +29,7 @@ def shifted(f, belief, move):
 
 
 def update(f, belief, named, flow_seen, flow_move):
-    """The belief after `flow_move` percent and the window that followed it."""
+    """Returns the belief after a move of `flow_move` percent and the window that followed it."""
     moved = np.stack([shifted(f, b, gain * flow_move) for b, gain in zip(belief, f["gains"], strict=True)])
     jumped = belief.mean(axis=0) @ f["jump"]
     belief = (1 - f["hazard"]) * moved + f["hazard"] * jumped
@@ -37,7 +39,8 @@ def update(f, belief, named, flow_seen, flow_move):
 
 
 def evidence(f, named, flow_seen):
-    """P(window | misreading, flow) up to a factor: by the flow that it shows, else by its class."""
+    """Returns P(window | misreading, flow) up to a factor: from the flow that the window shows, else from its
+    class."""
     if np.isfinite(flow_seen):
         deviation = (math.log(flow_seen / 100) - f["shown"] - f["bias"][:, None]) / f["noise"]
         density = np.exp(-0.5 * deviation**2) / f["noise"] / math.sqrt(2 * math.pi)
@@ -48,8 +51,9 @@ def evidence(f, named, flow_seen):
 
 
 def move(f, belief, flow_move):
-    """The move of the flow setpoint in percent with the least expected loss. A correction costs its fixed
-    cost where it begins: what goes on in the direction of flow_move, the last one, has paid it."""
+    """Returns the move of the flow setpoint in percent with the least expected loss. A correction has a fixed
+    cost at its start only. A move in the direction of the last one, `flow_move`, continues a correction and
+    has no fixed cost."""
     correction, begins = f["corrections"][:, None, None], f["begins"]
     miss = np.abs(f["grid"] + f["gains"][:, None] * correction - 100.0)
     normal = np.vectorize(lambda z: 0.5 * math.erfc(-z / math.sqrt(2)))

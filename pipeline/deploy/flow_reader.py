@@ -1,5 +1,5 @@
-"""The flow classifier with numpy alone: key areas -> class logits, log flow and its deviation; windows ->
-flow and class probabilities. Reads classifier.safetensors, which lies beside this file where it is
+"""The flow classifier with numpy alone: from key areas to class logits, log flow and its standard deviation;
+from windows to flow and class probabilities. Reads classifier.safetensors, which lies beside this file once
 exported."""
 
 import json
@@ -9,7 +9,7 @@ import numpy as np
 
 
 def read_safetensors(path):
-    """Arrays by name: a header of JSON, its length first, then the numbers."""
+    """Returns arrays by name. The file has the length of its header, the header in JSON, then the numbers."""
     with open(path, "rb") as stream:
         data = stream.read()
     start = 8 + int.from_bytes(data[:8], "little")
@@ -32,7 +32,8 @@ def norm(w, name, x):
 
 
 def block(w, name, x, wanted, heads):
-    """The first `wanted` tokens after one layer: attention, then feed-forward (Dosovitskiy et al. 2021)."""
+    """Returns the first `wanted` tokens after one layer: attention, then feed-forward (Dosovitskiy et al.
+    2021)."""
     n, tokens, d = x.shape
     qkv = dense(w, f"{name}.queries_keys_values", norm(w, f"{name}.norm_1", x))
     q, k, v = (part.reshape(n, tokens, heads, d // heads) for part in np.split(qkv, 3, axis=2))
@@ -46,7 +47,7 @@ def block(w, name, x, wanted, heads):
 
 
 def image_features(w, x):
-    """x (n, 16, 48), each scaled to mean 0 and deviation 1 -> class token of the last layer."""
+    """Returns the class token of the last layer for x (n, 16, 48), each scaled to mean 0 and deviation 1."""
     x = x - x.mean(axis=(1, 2), keepdims=True)
     x = x / (np.sqrt(np.mean(x**2, axis=(1, 2), keepdims=True)) + 1)
     (rows, columns), heads, n = w["patch"], int(w["heads"]), len(x)
@@ -61,8 +62,9 @@ def image_features(w, x):
 
 
 def outputs(w, key_area, temperature_degC):
-    """Logits (n, 3), log(flow / 100 %) (n,) and its deviation (n,) of key areas (n, 16, 48) in gray levels at
-    nozzle temperatures (n,): the mean over each area's four mirror images."""
+    """Returns logits (n, 3), log(flow / 100 %) (n,) and its standard deviation (n,). `key_area` (n, 16, 48)
+    in gray levels; `temperature_degC` (n,) of the nozzle. Features are averaged over each area's four mirror
+    images."""
     x, t = np.asarray(key_area, np.float32), np.asarray(temperature_degC, np.float32)[:, None]
     u = np.maximum(dense(w, "head.temperature", (t - 210) / 20), 0)
     mirrored = (x, x[:, ::-1], x[:, :, ::-1], x[:, ::-1, ::-1])
@@ -73,9 +75,9 @@ def outputs(w, key_area, temperature_degC):
 
 
 def window(w, log_flow, deviation, looks=None):
-    """Flow in percent, its relative deviation, and the probabilities of under, good, over of one window of
-    valid frames (m,). looks (measures,) is what lies around the bead, as pipeline/setpoint/frames/familiar.py
-    measures it; without it the deviation is larger."""
+    """Returns flow in percent, its relative standard deviation, and the probabilities of under, good, over of
+    one window of valid frames (m,). `looks` (measures,): measures around the bead, as in
+    pipeline/setpoint/frames/familiar.py; without them the standard deviation is larger."""
     weight, moved, unknown = np.asarray(deviation, float) ** -2.0, 0.0, w["looks_explained"]
     if looks is not None and np.isfinite(looks).all():
         z = (np.asarray(looks, float) - w["looks_mean"]) / w["looks_deviation"]

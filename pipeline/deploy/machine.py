@@ -1,13 +1,12 @@
-"""A controller as it leaves the house: the machine it is for, the law as it was judged, and the folder that
-holds both.
+"""A controller as exported: its machine, the law as it was judged, and the folder that holds both.
 
 A folder CONTROLLER has three files. controller.json is for people and programs: names, units, limits, sample
-time, contestant, hashes. arrays.safetensors has every array of the law, the governor, the model and the
-supervisor, bit by bit. certificate.json says what was shown of the two; it holds the SHA-256 of
+time, controller name, hashes. arrays.safetensors has every array of the law, the governor, the model and the
+supervisor, exactly. certificate.json states the measured results of the two; it holds the SHA-256 of
 
     cat controller.json arrays.safetensors | sha256sum
 
-so that neither can be changed without being noticed.
+so that neither can be changed unnoticed.
 """
 
 from __future__ import annotations
@@ -29,11 +28,12 @@ from pipeline.temperature.controllers.law import Plant
 
 VERSION = 1
 CONTROLLER, ARRAYS, CERTIFICATE = "controller.json", "arrays.safetensors", "certificate.json"
-EXPORTED = "exported.json"  # beside the folders of the loops: what there is, and why not
+EXPORTED = "exported.json"  # beside the folders of the loops: what was exported, and if not, why
 
 
 def plants_sha256(plants: Sequence[Plant]) -> str:
-    """SHA-256 of plants: every array of each, its shape before its numbers as little-endian doubles."""
+    """Returns the SHA-256 of plants: every array of each, its shape before its numbers as little-endian
+    doubles."""
     digest = hashlib.sha256()
     for plant in plants:
         for name, value in plant._asdict().items():
@@ -46,8 +46,8 @@ def plants_sha256(plants: Sequence[Plant]) -> str:
 
 
 def check(exported: Exported) -> None:
-    """Raises ValueError, naming the signal, where the machine is not one that the controller can be wired to:
-    limits missing or crossed, a unit or a sample time that is not the law's, a signal too few."""
+    """Raises ValueError, naming the signal, if the controller cannot be wired to the machine: limits missing
+    or crossed, a unit or a sample time that is not the law's, or too few signals."""
     machine, (m, p) = exported.machine, exported.controller.law.D.shape
     for kind, signals, count, unit in (
         ("input", machine.inputs, m, PERCENT),
@@ -112,7 +112,8 @@ def _check_sample_time(exported: Exported) -> None:
 
 
 def _check_limits(exported: Exported) -> None:
-    """The law keeps the limits that the machine declares, and the model has its signals."""
+    """Raises ValueError if the law does not keep the limits that the machine declares, or if the model has
+    other signals."""
     inputs, (m, p) = exported.machine.inputs, exported.controller.law.D.shape
     for what, deployed in (("law", exported.controller), ("fallback", exported.fallback)):
         if deployed is None:
@@ -137,7 +138,7 @@ def _check_limits(exported: Exported) -> None:
 
 
 def check_certificate(exported: Exported, certificate: Certificate) -> None:
-    """Raises ValueError where the certificate was not passed, or is of another controller, plant, spread,
+    """Raises ValueError if the certificate was not passed, or belongs to another controller, plant, spread,
     sample time or unit."""
     if certificate.verdict != "passed":
         raise ValueError(
@@ -170,7 +171,7 @@ def _units(inputs: Sequence[Signal], outputs: Sequence[Signal]) -> str:
 
 
 def write(folder: str | Path, exported: Exported, certificate: Certificate) -> None:
-    """The three files of a CONTROLLER folder. Raises ValueError, and writes nothing, if `check` or
+    """Writes the three files of a CONTROLLER folder. Raises ValueError, and writes nothing, if `check` or
     `check_certificate` refuses."""
     check(exported)
     check_certificate(exported, certificate)
@@ -179,14 +180,14 @@ def write(folder: str | Path, exported: Exported, certificate: Certificate) -> N
 
 
 def write_controller(folder: str | Path, exported: Exported) -> None:
-    """controller.json and arrays.safetensors."""
+    """Writes controller.json and arrays.safetensors."""
     text, arrays = parts(exported)
     artifacts.write_text(Path(folder) / CONTROLLER, text)
     artifacts.write_weights(Path(folder) / ARRAYS, "controller", arrays, {})
 
 
 def read(folder: str | Path) -> tuple[Exported, Certificate]:
-    """The controller and certificate of a folder that `write` wrote. Raises ValueError where a file is
+    """Returns the controller and certificate of a folder that `write` wrote. Raises ValueError if a file is
     missing, broken, or not the one that was certified."""
     folder = Path(folder)
     if not (folder / CONTROLLER).exists() and (why := _why_none(folder)):
@@ -222,20 +223,21 @@ def read(folder: str | Path) -> tuple[Exported, Certificate]:
 
 
 def _why_none(folder: Path) -> str:
-    """Why the stage export_controllers left no controller in its folder, in its own words; "" if it did not
-    say."""
+    """Returns why the stage export_controllers left no controller in its folder, in its own words; "" if it
+    gave no reason."""
     stated = folder.parent / EXPORTED
     return artifacts.read_json(stated).get(folder.name, {}).get("why", "") if stated.exists() else ""
 
 
 def controller_sha256(exported: Exported) -> str:
-    """SHA-256 of controller.json and arrays.safetensors, one after the other, as `write` writes them."""
+    """Returns the SHA-256 of controller.json and arrays.safetensors, one after the other, as `write` writes
+    them."""
     text, arrays = parts(exported)
     return hashlib.sha256(text.encode() + packed(arrays)).hexdigest()
 
 
 def packed(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """arrays.safetensors."""
+    """Returns the bytes of arrays.safetensors."""
     return as_bytes(dict(sorted(arrays.items())), {"beadline": "schema=controller"})
 
 
@@ -247,7 +249,7 @@ def _digest(folder: Path) -> str:
 
 
 def parts(exported: Exported) -> tuple[str, dict[str, np.ndarray]]:
-    """The text of controller.json, and the arrays by dotted names."""
+    """Returns the text of controller.json, and the arrays by dotted names."""
     machine, rate = exported.machine, exported.controller.limits.rate
     about = {
         "version": VERSION,
@@ -272,7 +274,8 @@ def parts(exported: Exported) -> tuple[str, dict[str, np.ndarray]]:
 
 
 def canonical(exported: Exported) -> Exported:
-    """The controller with its arrays in the order of their files: products of matrices round by that."""
+    """Returns the controller with the memory order of its arrays as read from the files, because the rounding
+    of matrix products depends on it."""
     text, arrays = parts(exported)
     return restored(json.loads(text), arrays)
 
@@ -287,12 +290,12 @@ def _declared(signal: Signal) -> dict[str, Any]:
 
 
 def _number(value: float) -> float | None:
-    """JSON knows no infinity: null where no limit is declared."""
+    """Returns null for a limit that is not declared, since JSON has no infinity."""
     return float(value) if np.isfinite(value) else None
 
 
 def _flatten(place: str, value: Any) -> dict[str, np.ndarray]:
-    """Arrays and numbers of a record under dotted names; None leaves no trace."""
+    """Returns arrays and numbers of a record under dotted names; None is left out."""
     if value is None:
         return {}
     if not hasattr(value, "_asdict"):

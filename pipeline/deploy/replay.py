@@ -1,12 +1,12 @@
-"""What a controller would have asked on a recorded machine, sample by sample.
+"""Computes what a controller would have requested on a recorded machine, sample by sample.
 
-The law sees what the machine measured and what it was really given: its memory, its integrator and its
-governor go on from the recorded inputs, as those of `controllers.law.RunningController` do where
-another hand moves the heaters. What it asks at a sample is therefore what it would have applied there; of a
-recording of its own closed loop it is that loop's commands.
+The law gets what the machine measured and the inputs that were really applied. Its memory, its integrator and
+its governor continue from the recorded inputs, as those of `controllers.law.RunningController` do in manual.
+So what it requests at a sample is what it would have applied there; on a recording of its own closed loop
+these are that loop's commands.
 
-Memory and integrator go through a recording sample by sample. The governor, which is slow and forgets, goes
-in chunks side by side, each of which starts early enough.
+Memory and integrator run through a recording sample by sample. The governor, which is slow and forgets, runs
+in parallel chunks, each of which starts early enough.
 """
 
 from typing import NamedTuple
@@ -36,7 +36,7 @@ MOST_REFERENCES = 500  # each is aimed at by a quadratic programme
 
 class GaplessLog(NamedTuple):
     """A recorded stretch without a gap: inputs u (T, m) in percent that were applied, outputs y (T, p) in °C
-    measured before, references r (T, p) in °C; all finite."""
+    measured before them, references r (T, p) in °C; all finite."""
 
     u: np.ndarray
     y: np.ndarray
@@ -44,8 +44,8 @@ class GaplessLog(NamedTuple):
 
 
 class Replayed(NamedTuple):
-    """(T, .): inputs that the law wished; within limits and rate; and asked for, after the governor; the
-    target in °C, which is the reference or the nearest that the inputs can hold."""
+    """Inputs (T, m): `wished` by the law; `limited` by limits and rate; and `asked`, after the governor.
+    `target` (T, p) in °C: the reference, or the nearest that the inputs can hold."""
 
     wished: np.ndarray
     limited: np.ndarray
@@ -59,9 +59,9 @@ WHY = ("", "limit", "rate", "governor")
 def replayed(
     controller: Deployed, model: Plant, log: GaplessLog, *, hold: int = 30, forward: np.ndarray | float = 0.0
 ) -> Replayed:
-    """What the controller would have asked on a log. It watches the first `hold` samples, for which nothing
-    is asked: they are as recorded. `forward` (T, m) is what is fed forward: the inputs of the log are without
-    it, those that are asked for with it."""
+    """Returns what the controller would have requested on a log. It only watches the first `hold` samples,
+    and these inputs are as recorded. `forward` (T, m): what is fed forward. The inputs of the log are without
+    it, the requested ones include it."""
     T = len(log.u)
     hold = min(max(hold, 1), T)
     feeds, target, here = _aimed(controller, model, log, hold)
@@ -86,7 +86,8 @@ def replayed(
 
 
 def why(controller: Deployed, log: GaplessLog, run: Replayed) -> np.ndarray:
-    """Of each sample and input (T, m) the index in WHY of what kept it from what the law wished."""
+    """Returns, for each sample and input (T, m), the index in WHY of what changed the command that the law
+    wished."""
     limits, tiny = controller.limits, 1e-9 * (controller.limits.high - controller.limits.low)
     outside = (run.wished < limits.low - tiny) | (run.wished > limits.high + tiny)
     cut = np.abs(run.limited - run.wished) > tiny
@@ -98,7 +99,8 @@ def why(controller: Deployed, log: GaplessLog, run: Replayed) -> np.ndarray:
 def _aimed(
     controller: Deployed, model: Plant, log: GaplessLog, hold: int
 ) -> tuple[np.ndarray, np.ndarray, Aim]:
-    """Feed (T, m) and target (T, p) of each sample, and the aim at where the machine is at the hand-over."""
+    """Returns feed (T, m) and target (T, p) of each sample, and the aim for the machine's state at the
+    hand-over."""
     law, limits = controller.law, controller.limits
 
     def of(reference: Reference) -> Aim:
@@ -116,7 +118,7 @@ def _aimed(
 
 
 def _held(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The references that are asked for (k, p), and which of them at each sample (T,)."""
+    """Returns the different references (k, p), and which of them applies at each sample (T,)."""
     new = np.r_[True, (r[1:] != r[:-1]).any(axis=1)]
     asked, which = np.unique(r[new], axis=0, return_inverse=True)
     return asked, which.ravel()[np.cumsum(new) - 1]
@@ -125,8 +127,8 @@ def _held(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _wished(
     controller: Deployed, log: GaplessLog, feeds: np.ndarray, target: np.ndarray, here: Aim, hold: int
 ) -> np.ndarray:
-    """What the law wishes (T, m), sample by sample from `hold` on. Its memory goes on from the recorded
-    inputs, without the governor."""
+    """Returns what the law wishes (T, m), sample by sample from `hold` on. Its memory continues from the
+    recorded inputs, without the governor."""
     bare, wished = controller._replace(governor=None), log.u.copy()
     samples = list(zip(*(part[:, None] for part in log), strict=True))
     state = watched(bare, None, *samples[0])
@@ -140,22 +142,22 @@ def _wished(
     return wished
 
 
-WARM_UP = 3000  # samples after which what a governor at its own pace remembers has faded to 3e-7
+WARM_UP = 3000  # samples after which the memory of a governor at its usual pace has faded to 3e-7
 SIDE_BY_SIDE = 400  # chunks of a long recording
 
 
 def _governed(
     family: Governor, log: GaplessLog, u: np.ndarray, target: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Commands (T, m) after the governor, whose memory goes on from the recorded inputs. Chunks start so much
-    earlier that what they have not seen has faded."""
+    """Returns the commands (T, m) after the governor, whose memory continues from the recorded inputs. Chunks
+    start early enough that what they have not seen no longer matters."""
     T, warm = len(u), int(min(WARM_UP * max(0.005 / family.forgets, 1.0), len(u)))
     length = max(-(-T // SIDE_BY_SIDE), min(T, 2 * warm // 3), 1)
     first = np.arange(0, T, length)
     at = np.maximum(first - warm, 0)
     memory, asked = started(family, log.y[at]), u.copy()
     for step in range(warm + length):
-        # chunks near the beginning have less before them, and wait
+        # chunks near the beginning have fewer samples before them, and wait
         now = first - warm + step
         mine = np.flatnonzero((now >= 0) & (now < T))
         rows = now[mine]

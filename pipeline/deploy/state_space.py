@@ -1,7 +1,7 @@
-"""Plant, controller and the loop of both as linear systems with named signals, made with python-control:
+"""Plant, controller and their closed loop as linear systems with named signals, made with python-control:
 systems.json for any program, systems.mat for Matlab and Octave.
 
-They hold small signals: deviations from rest, without limits, governor, supervisor and what is fed forward.
+They describe small signals: deviations from rest, without limits, governor, supervisor and feed-forward.
 """
 
 import io
@@ -21,14 +21,14 @@ HEADER = b"MATLAB 5.0 MAT-file, beadline".ljust(116)  # scipy's own holds the da
 
 
 def systems(exported: Exported) -> dict[str, control.StateSpace]:
-    """ "plant" from inputs u (m,) in percent to outputs y (p,) in °C; "controller" from references r and y to
-    u; "loop" from r to y and u:
+    """Returns the systems by name: "plant" from inputs u (m,) in percent to outputs y (p,) in °C;
+    "controller" from references r and y to u; "loop" from r to y and u:
 
         z(t+1) = A z + B_u u + B_y y + B_r r,  xi(t+1) = xi + integral (r - y)
-        u = F r - K z - D y - K_r xi,          F r what holds y at r
+        u = F r - K z - D y - K_r xi,          F r holds y at r
     """
     machine, law, model = exported.machine, exported.controller.law, strictly_proper(exported.model)
-    # python-control takes what follows a dot for a signal of another system
+    # python-control reads the part after a dot as a signal of another system
     u, y = ([one.name.replace(".", "_") for one in side] for side in (machine.inputs, machine.outputs))
     r, T = [f"{name}_reference" for name in y], machine.sample_time_s
     p, q = len(y), len(law.A)
@@ -48,13 +48,14 @@ def systems(exported: Exported) -> dict[str, control.StateSpace]:
 
 
 def files(exported: Exported) -> dict[str, bytes]:
-    """The folder's files, name to content."""
+    """Returns the folder's files, name to content."""
     text = json.dumps(described(exported), indent=1, allow_nan=False) + "\n"
     return {"systems.json": text.encode(), "systems.mat": mat(exported)}
 
 
 def described(exported: Exported) -> dict[str, Any]:
-    """What systems.json holds: matrices row by row, names, poles, and the bandwidth of the plant."""
+    """Returns the content of systems.json: matrices row by row, names, poles, and the bandwidth of the
+    plant."""
     made = systems(exported)
     return {
         "sample_time_s": exported.machine.sample_time_s,
@@ -70,7 +71,7 @@ def described(exported: Exported) -> dict[str, Any]:
 
 
 def mat(exported: Exported) -> bytes:
-    """systems.mat: a struct for each system, with names as cells."""
+    """Returns systems.mat: a struct for each system, with names as cells."""
     contents: dict[str, Any] = {"note": NOTE, "Ts": exported.machine.sample_time_s}
     for name, one in systems(exported).items():
         names = {"inputs": one.input_labels, "outputs": one.output_labels}

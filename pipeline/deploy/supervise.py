@@ -1,32 +1,30 @@
-"""The supervisor round a law: six faults that a firmware does not see, each with its safe mode, its reason in
-one sentence, and the way back.
+"""The supervisor around a control law. It detects six faults that a firmware does not see, each with its safe
+mode, its reason in one sentence, and the way back.
 
-An observer of the model follows the machine. Every few samples a forecast starts from it that no reading
-corrects (a window). As long as a window lasts, readings are held against it:
+An observer of the model follows the machine. Every few samples it starts a forecast that no reading corrects
+(a window). As long as a window lasts, readings are compared with it:
 
-* A sensor stands still if the forecast moves by three of its steps, or four deviations of its noise, and the
-  reading does not move with it, with its noise on top or without. If readings in steps finer than their
-  noise are all equal, the forecast need not be surer than that.
-* What readings r miss of the forecast is explained by one cause that began when one of the windows did, by
-  least squares:
-
+* A sensor stands still if the forecast moves by three of the sensor's steps, or four deviations of its noise,
+  and the reading does not move with it, with its noise on top or without. If readings in steps finer than
+  their noise are all equal, the forecast may be less certain.
+* The readings' error r against the forecast is explained by one cause that began when one of the windows did,
+  by least squares:
       r = -a g              a heater lacks the share a of what it is told
       r = a (high U - g)    it gives a share a of what it could add: 1 if it is stuck on
       r = q U               a fan, a door, filament or the room take or give q percent: no fault
       r = -tau (g - g')     the machine is late by tau samples: no fault
       r = c                 what the sensor sees of air or filament at once: no fault
-
   with g the response to the input since then, g' that a sample ago, U that to one percent. A heater is
-  at fault if that explains the readings clearly better than what is no fault.
-* A window has two forecasts, from the drift as it was when it began and from its mean. Slow masses, such as
-  the walls of a chamber, move the machine between the two. A sensor stands still only if both move the same
-  way. A heater is stuck on only if the readings rise above both.
+  at fault if that explains the readings clearly better than the causes that are no fault.
+* A window has two forecasts, one from the drift as it was when the window began and one from the mean drift.
+  Slow masses, such as the walls of a chamber, move the machine between the two. A sensor stands still only if
+  both forecasts move the same way. A heater is stuck on only if the readings rise above both.
 * The drift follows any slow loss of heat. A sensor that drifts, or sticks with noise just below its
   reference, looks like such a loss. So the drift has a bound that does not adapt: if more heat is missing
   than a fan or filament takes, for longer than a door is open, and the readings do not rise, then the heater
   or its sensor is in doubt.
 
-`Kept` is all that is remembered: arrays of fixed size, plain arithmetic.
+`Kept` holds all that the supervisor remembers: arrays of fixed size, plain arithmetic.
 """
 
 from __future__ import annotations
@@ -63,8 +61,8 @@ PERCENT, DEGC = "percent", "degC"
 
 
 class Signal(NamedTuple):
-    """An input with the limits of its command, or an output with its declared limits, -inf and inf where
-    none is."""
+    """An input with the limits of its command, or an output with its declared limits; -inf and inf if not
+    declared."""
 
     name: str
     unit: str
@@ -73,7 +71,7 @@ class Signal(NamedTuple):
 
 
 def signal(about: Mapping[str, Any]) -> Signal:
-    """The signal of a JSON object, in which null is a limit that is not declared."""
+    """Returns the signal of a JSON object, in which null is a limit that is not declared."""
     low, high = about["low"], about["high"]
     return Signal(
         about["name"], about["unit"], -np.inf if low is None else low, np.inf if high is None else high
@@ -81,8 +79,8 @@ def signal(about: Mapping[str, Any]) -> Signal:
 
 
 class Machine(NamedTuple):
-    """What a controller is wired to: its signals in order, the time between two samples, and the measured
-    disturbances that it is told."""
+    """The machine that a controller is wired to: its signals in order, the time between two samples, and the
+    measured disturbances that the controller gets."""
 
     inputs: tuple[Signal, ...]
     outputs: tuple[Signal, ...]
@@ -108,49 +106,50 @@ LAW, OWN, OFF = range(3)
 
 WINDOWS, SPACING = 6, 6  # forecasts side by side, and samples from one to the next
 STILL_AFTER = 10  # samples for which a forecast must have been away before a sensor stands still
-FIT_AFTER = 12  # samples of a window before it tells of a heater
+FIT_AFTER = 12  # least samples of a window before a heater is judged by it
 STEPS_STILL, NOISE_STILL = 3.0, 4.0  # steps and deviations that a forecast must move
 SAME_STEPS, SAME_NOISE = 1.5, 6.0  # steps and deviations within which a reading has not moved
 FOLLOWS = (0.7, 1.4)  # share of the forecast's move by which a sensor is cleared
-CLEARED_S = 60.0  # for how long it is cleared then
-# why readings miss the forecast: a heater lacks a share, or gives one of what it could add; heat of the
-# surroundings as a share of the input's range; samples late; a heater that differs from the model by a share;
-# a step of the reading in degC
+CLEARED_S = 60.0  # for how long it then counts as cleared
+# why readings differ from the forecast: a heater lacks a share, or gives a share of what it could add; heat
+# of the surroundings as a share of the input's range; samples late; a heater that differs from the model by a
+# share; a step of the reading in degC
 LACKS, GIVES, HEAT, LATE, DIFFERS, SHIFTS = range(6)
 LEAST = np.array([0.35, 0.6, -0.3, -8.0, -0.25, -1e3])
 MOST = np.array([1.0, 1.5, 0.3, 8.0, 0.25, 1e3])
-CLEARER = 16.0  # of -2 log likelihood, by which a fault must explain better than what is none
-MISFIT = 0.15  # of what readings miss, which even the right cause leaves: no model is the machine
-DOUBT = 0.25  # share of what inputs did lately by which a forecast may be wrong
-RESTS = 1 / 40  # share a sample by which that is forgotten
-REPEATED = 3  # samples in a row with a reading that is none
-SHOWN = 6  # samples in a row that show a fault
-SLOWLY = 1 / 60  # share a sample of the mean drift, from which heat is counted
-EARLY, JUMP = 0.5, 10.0  # shares of the sample time between which two samples are apart
-MOST_STEP_DEGC = 5.0  # what moves by more at first was perhaps switched on
+CLEARER = 16.0  # of -2 log likelihood, by which a fault must explain better than causes that are no fault
+MISFIT = 0.15  # fraction of the readings' error that even the right cause leaves, since no model is exact
+DOUBT = 0.25  # fraction of the inputs' recent effect by which a forecast may be wrong
+RESTS = 1 / 40  # fraction by which this effect fades in each sample
+REPEATED = 3  # successive samples with an invalid reading
+SHOWN = 6  # successive samples that must show a fault
+SLOWLY = 1 / 60  # fraction by which the mean drift follows in each sample
+EARLY, JUMP = 0.5, 10.0  # shortest and longest valid time between two samples, in sample times
+MOST_STEP_DEGC = 5.0  # a larger first move may come from power-on
 # a sensor's steps until it has moved: one of 2.5 degC moves before its forecast has moved enough to judge it
 UNKNOWN_STEP_DEGC = 1.0
-# shares of an input's range, of heat that is missing; with the heater at its limit
+# missing heat that counts, as shares of an input's range: in general, and with the heater at its limit
 MISSING, AT_LIMIT = 0.4, 0.1
-MISSING_FOR, DOOR_S = 60, 110.0  # for so many samples, and longer than a door is open
+MISSING_FOR, DOOR_S = 60, 110.0  # for how many samples it must be missing; longest time that a door is open
 FAR_DEGC = 1e4  # no machine is so hot: its model is unstable, and no reading corrects it
 SETTLES = 30  # samples from the first, in which the observer finds the machine and no forecast begins
 BACK_S = 30.0  # without a cause, after which the law takes over again
-RETURNS = 3  # times an hour that heaters which went off are tried again
+RETURNS = 3  # times an hour that heaters are tried again after they went off
 
 
 class Supervision(NamedTuple):
-    """What a machine is watched by.
+    """The parameters of a machine's supervisor.
 
-    A (n, n), B (n, m), C (p, n), b (n,), d (p,): the model with a drift w (p) in degC a step as its last
-    states; L, M (n, p) move its state by an innovation, from one sample to the next and at once; `hurried` is
-    added to L in manual; `unsure` (WINDOWS SPACING + 1, p) in degC is the deviation of a forecast by its age,
-    `wander` the sum of four times its squares.
-    It starts at start y + start_0, the state in which inputs hold y for long. low, high (m,) in percent;
-    `coldest`, `hottest` (p,) in degC between which a reading is one. Pairs (q,) of an output `of_input` and
-    an input `input_of`: first the output in which each input has the largest share, then the outputs that
-    are left, with the input that moves them most. `heat` (m, p) is the share of the inputs' range that a
-    drift of 1 stands for, `missing_for` the samples for which heat must be missing.
+    `A` (n, n), `B` (n, m), `C` (p, n), `b` (n,), `d` (p,): the model, with a drift w (p) in degC a step as
+    its last states. `L`, `M` (n, p): move its state by an innovation, from one sample to the next and at
+    once; `hurried` is added to L in manual. `unsure` (WINDOWS SPACING + 1, p) in degC: standard deviation of
+    a forecast by its age; `wander`: cumulative sum of four times its squares.
+
+    The state starts at start y + start_0, in which inputs hold y for long. `low`, `high` (m,) in percent;
+    `coldest`, `hottest` (p,) in degC: range of valid readings. Pairs (q,) of an output `of_input` and an
+    input `input_of`: first, for each input, the output in which it has the largest share; then the remaining
+    outputs, with the input that moves them most. `heat` (m, p): share of the inputs' range that a drift of 1
+    stands for; `missing_for`: samples for which heat must be missing.
     """
 
     A: np.ndarray
@@ -178,22 +177,23 @@ class Supervision(NamedTuple):
     reach_degC: float
 
     def coarser(self, quantum: np.ndarray) -> np.ndarray:
-        """How often the sensors' noise (p,) their readings deviate, with steps of `quantum` (p,) in degC."""
+        """Returns the factor (p,), at least 1, by which readings with steps of `quantum` (p,) in degC deviate
+        more than the sensors' noise."""
         return np.maximum(1.0, known_steps(quantum) / np.sqrt(12) / self.noise_degC)
 
 
 def known_steps(quantum: np.ndarray) -> np.ndarray:
-    """Steps of sensors (p,) in degC; UNKNOWN_STEP_DEGC as long as they are not known."""
+    """Returns the steps of sensors (p,) in degC; UNKNOWN_STEP_DEGC as long as they are unknown."""
     return np.where(np.isfinite(quantum), quantum, UNKNOWN_STEP_DEGC)
 
 
 class Exported(NamedTuple):
-    """A controller as it leaves the house.
+    """A controller as exported.
 
-    `controller` is the contestant `name` as it was judged: law, limits, integral limit, governor. References
-    are aimed at on `model`, and the supervisor's forecasts run on it. `fallback` is the machine's own PID or
-    a PI under the same limits, the safe mode "own"; None: the heaters go off. `simulated`: the plant was
-    drawn, not recorded.
+    `controller`: the controller `name` as it was judged, with law, limits, integral limit and governor.
+    `model`: for the feasible targets and the supervisor's forecasts. `fallback`: the machine's own PID, or a
+    PI under the same limits, as the safe mode "own"; None: the heaters go off instead. `simulated`: the plant
+    was drawn at random, not recorded.
     """
 
     name: str
@@ -222,7 +222,7 @@ RECORDS = {
 
 
 def restored(about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Exported:
-    """The controller of controller.json and of its arrays by dotted names. Raises KeyError if one is
+    """Returns the controller from controller.json and its arrays by dotted names. Raises KeyError if one is
     missing."""
     sides = (tuple(map(signal, about[side])) for side in ("inputs", "outputs", "disturbances"))
     inputs, outputs, disturbances = sides
@@ -234,7 +234,7 @@ def restored(about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Expo
 
 
 def _record(place: str, arrays: Mapping[str, np.ndarray]) -> Any:
-    """What stands under a dotted name: a record, an array or a number; None for a record without any."""
+    """Returns the record, array or number under a dotted name; None if nothing is stored for a record."""
     kind = RECORDS.get(place.rpartition(".")[2])
     if kind is None:
         return arrays[place] if arrays[place].ndim else arrays[place].item()
@@ -244,8 +244,8 @@ def _record(place: str, arrays: Mapping[str, np.ndarray]) -> Any:
 
 
 class Cause(NamedTuple):
-    """What is wrong: its kind (KINDS), the signal's name, the reason in one sentence, and the time since
-    when."""
+    """What is wrong: its kind (KINDS), the signal's name, the reason in one sentence, and the time at which
+    it began."""
 
     kind: str
     signal: str
@@ -265,29 +265,35 @@ class Decision(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """All that the supervisor remembers, arrays that are changed in place.
+    """All that the supervisor remembers, in arrays that are changed in place.
 
-    By kind and signal (k, w): since and last in s of the supervisor's own time, -1 if not so; amount.
+    By kind and signal (k, w): `since` and `last`, first and last time of a cause, in s of the supervisor's
+    own time, -1 if there is none; `amount`.
 
-    The observer: x (n,), the innovation e (p,) before, the mean drift `slow` (p,), the forecast `expected`
-    (p,). By output (p,): y the last reading and its repeats, quantum the smallest move seen (infinite: none;
-    NaN: a large one, perhaps of power-on), bad readings in a row, cleared_s the time at which it last moved
-    as forecast, returns how often it was trusted again, the last time at returned_s.
+    The observer: `x` (n,); `e` (p,), the last innovation; `slow` (p,), the mean drift; `expected` (p,), the
+    forecast.
 
-    Windows (K): states (2, K, n), from the drift as it was and from its mean; given and unit (K, n, m),
-    the responses to the inputs and to one percent of each; before (K, q) the former a sample ago;
-    began, first, least, most (K, p) the forecast and the reading at first, the least and the most reading;
-    away (K, p) samples in a row in which the forecast was away from it; square (K, q) the sum of r^2, causes
-    (K, q, 6) that of each cause's signature squared, cross (K, K, q, 6) that of r of a window times the
-    signature of a cause that began with another; age (K,) in samples, -1 for none.
+    By output (p,): `y`, the last reading, and its `repeats`; `quantum`, the smallest move seen (infinite:
+    none; NaN: a large one, perhaps of power-on); `bad`, successive bad readings; `cleared_s`, the time at
+    which it last moved as forecast; `returns`, how often it was trusted again, the last time at `returned_s`.
 
-    shown (2, m): samples in a row in which a heater was stuck on, or weak; missing (m,) samples in a
-    row in which its heat was. asked (m,) the last command,
-    usual (m,) its mean, stirred (m,) how far it was from it lately; forward (m,) what was added to it for
-    disturbances, which it makes up for: forecasts run without both.
-    counters (6,): samples, mode, 1 once the clock was read, causes that are there, samples under the law, 1
-    after a gap of the clock that is none.
-    clock_s (2,): the clock at the last sample, and the supervisor's own time, which never falls.
+    Windows (K): `states` (2, K, n), from the drift as it was and from its mean; `given` and `unit` (K, n, m),
+    the responses to the inputs and to one percent of each; `before` (K, q), the output of `given` a sample
+    ago; `age` (K,), in samples, -1 for no window. Readings in a window (K, p): `began` and `first`, the
+    forecast and the reading at the start; `least` and `most`, the least and the largest reading; `away`,
+    successive samples in which the forecast was away from where it began. Sums over a window: `square` (K,
+    q), of r^2; `causes` (K, q, 6), of each cause's signature squared; `cross` (K, K, q, 6), of r of a window
+    times the signature of a cause that began with another window; `total` (2, K, p), of the reading minus
+    `began`, and of its square.
+
+    By heater (m,): `shown` (2, m), successive samples in which it was stuck on, or weak; `missing`, in which
+    its heat was missing; `asked`, the last command; `usual`, its mean; `stirred`, how far it was from its
+    mean lately; `forward`, what was added to it for disturbances. This makes up for the disturbances, so
+    forecasts run without both.
+
+    `counters` (6,): samples; mode; 1 once the clock was read; present causes; calls of `step`; 1 after an
+    invalid time step of the clock. `clock_s` (2,): the clock at the last sample, and the supervisor's own
+    time, which never decreases.
     """
 
     since: np.ndarray
@@ -332,7 +338,7 @@ SAMPLES, MODE, CLOCKED, ACTIVE, RUNS, INSANE = range(6)
 
 
 def kept(s: Supervision) -> Kept:
-    """A memory that has seen nothing."""
+    """Returns a memory that has seen nothing."""
     n, m, p, q, K = len(s.A), len(s.low), len(s.d), len(s.of_input), WINDOWS
     w, k = max(m, p), len(KINDS)
     return Kept(
@@ -379,7 +385,7 @@ def kept(s: Supervision) -> Kept:
 
 
 def say(k: Kept, kind: int, signal: int, amount: float = 0.0) -> None:
-    """A cause is there now; what was said first of it stays."""
+    """Records that a cause is present now; its first amount is kept."""
     if k.since[kind, signal] < 0:
         k.since[kind, signal], k.amount[kind, signal] = k.clock_s[1], amount
         k.counters[ACTIVE] += 1
@@ -387,8 +393,9 @@ def say(k: Kept, kind: int, signal: int, amount: float = 0.0) -> None:
 
 
 def pass_time(s: Supervision, k: Kept, t_s: float) -> int:
-    """Whole samples since the last one, by which the supervisor's own time goes on. A clock that tells no
-    time between two samples, or a long one, counts as one; the first time forecasts begin anew."""
+    """Returns the whole samples since the last one, and advances the supervisor's own time. If the clock's
+    time step is too short or too long (EARLY, JUMP), it counts as one sample, and the first such step in a
+    row restarts the forecasts."""
     if not k.counters[CLOCKED]:
         k.clock_s[0], k.counters[CLOCKED] = t_s - s.sample_time_s, 1
     gap_s = t_s - k.clock_s[0]
@@ -403,7 +410,8 @@ def pass_time(s: Supervision, k: Kept, t_s: float) -> int:
 
 
 def read(s: Supervision, k: Kept, y: np.ndarray) -> np.ndarray:
-    """Whether each output (p,) counts now; says which gives no number, or one out of its range."""
+    """Returns whether each output (p,) is valid now; records as causes outputs that give no number, or one
+    out of range."""
     counts = np.isfinite(y) & (y >= s.coldest) & (y <= s.hottest)
     k.bad[:] = np.where(counts, 0, k.bad + 1)
     for j in np.flatnonzero(k.bad >= REPEATED):
@@ -417,7 +425,7 @@ def read(s: Supervision, k: Kept, y: np.ndarray) -> np.ndarray:
 
 
 def begin_window(s: Supervision, k: Kept, at: int) -> None:
-    """A forecast from where the machine is now."""
+    """Starts a forecast from the machine's present state."""
     start = k.x + s.M @ k.e
     k.states[:, at] = start
     k.states[1, at, -len(s.d) :] = k.slow
@@ -425,13 +433,13 @@ def begin_window(s: Supervision, k: Kept, at: int) -> None:
         part[at] = 0
     k.cross[:, at] = k.total[:, at] = 0.0
     k.began[at] = s.C @ start + s.d
-    # a sensor may be far from its forecast: whether it moves is told from its own readings
+    # a sensor may be far from its forecast, so whether it moves is judged by its own readings
     k.first[at] = k.least[at] = k.most[at] = np.where(np.isfinite(k.y), k.y, k.began[at])
     k.age[at] = 0
 
 
 def advance(s: Supervision, k: Kept, u: np.ndarray) -> None:
-    """Observer and windows a sample on, inputs u (m,) applied."""
+    """Advances observer and windows by one sample, with inputs u (m,) applied."""
     on = s.B @ u + s.b
     k.x[:] = s.A @ k.x + on + s.L @ k.e
     runs = k.age >= 0
@@ -442,7 +450,7 @@ def advance(s: Supervision, k: Kept, u: np.ndarray) -> None:
 
 
 def compare(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
-    """Readings y (p,) that count against every window: what moved, and the sums of the fits."""
+    """Compares valid readings y (p,) with every window: what moved, and the sums for the fits."""
     k.least[:] = np.where(counts, np.minimum(k.least, y), k.least)
     k.most[:] = np.where(counts, np.maximum(k.most, y), k.most)
     own, inputs = s.of_input, s.input_of
@@ -461,21 +469,23 @@ def compare(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
 
 
 def threshold(s: Supervision, k: Kept) -> np.ndarray:
-    """By how many degC (K, p) a forecast must move, or be missed, before a sensor or heater is judged."""
+    """Returns by how many degC (K, p) a forecast must move, or differ from the reading, before a sensor or
+    heater is judged."""
     least = np.maximum(STEPS_STILL * known_steps(k.quantum), NOISE_STILL * s.noise_degC)
     unsure = s.unsure[np.minimum(np.maximum(k.age, 0), len(s.unsure) - 1)]
     return np.maximum(least, NOISE_STILL * unsure * s.coarser(k.quantum))
 
 
 def both_ahead(s: Supervision, k: Kept, y: np.ndarray) -> np.ndarray:
-    """By how many degC (K, p) both forecasts, from the drift as it was and from its mean, are above y (p,) or
-    (K, p), or below it if negative; 0 if y lies between them."""
+    """Returns by how many degC (K, p) both forecasts, from the drift as it was and from its mean, are above y
+    (p,) or (K, p), or below it if negative; 0 if y lies between them."""
     first, second = k.states @ s.C.T + s.d - y
     return np.where(first * second > 0, np.where(np.abs(first) < np.abs(second), first, second), 0.0)
 
 
 def clear_sensors(s: Supervision, k: Kept) -> None:
-    """Clears sensors that move as forecast, and counts the samples for which each forecast was away."""
+    """Clears sensors that move as forecast, and counts the samples in which each forecast was away from its
+    start."""
     moves, moved = k.states[0] @ s.C.T + s.d - k.began, k.y - k.first
     large = (np.abs(moves) >= threshold(s, k)) & (k.age > 0)[:, None]
     share = moved / np.where(large, moves, 1.0)
@@ -485,8 +495,8 @@ def clear_sensors(s: Supervision, k: Kept) -> None:
 
 
 def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
-    """Says which sensors stand still while the forecast moves, and which heater heats otherwise than it was
-    told: what explains clearly better than anything that is no fault."""
+    """Records which sensors stand still while the forecast moves, and which heater heats differently from its
+    command, if this explains the readings clearly better than any cause that is no fault."""
     judge_heat(s, k, y, counts)
     clear_sensors(s, k)
     own, age, m = s.of_input, np.maximum(k.age, 1)[:, None], len(s.low)
@@ -509,7 +519,7 @@ def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
     left = np.where(later[:, :, None, None], np.maximum(left, floor[:, None, :, None]), 1e300)
     honest = np.minimum(left[..., HEAT:].min(axis=(1, 3)), np.maximum(k.square, floor))
     same = k.most - k.least <= same_degC(s, k)
-    # a heater that is stuck on heats, and by more than the drift of either forecast
+    # a heater that is stuck on must heat, and by more than the drift of either forecast
     heats = (y - k.least > same_degC(s, k)) & (-both_ahead(s, k, y) >= least)
     judge_sensors(s, k, moves, still & same, honest, noise)
     left, honest, floor = left[:, :, :m], honest[:, :m], floor[:, :m]
@@ -534,8 +544,8 @@ def judge(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
 
 
 def judge_heat(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> None:
-    """Says whose heat is missing for long: more than disturbances take, or some of it while the heater is at
-    its limit, as long as its output does not rise."""
+    """Records heaters whose heat is missing for long: more than disturbances take, or a smaller amount while
+    the heater is at its limit, as long as the output does not rise."""
     m, p, window = len(s.low), len(s.d), int(k.age.argmax())
     own, span = s.of_input[:m], s.high - s.low
     lost = -s.heat @ k.x[-p:]
@@ -547,20 +557,22 @@ def judge_heat(s: Supervision, k: Kept, y: np.ndarray, counts: np.ndarray) -> No
 
 
 def say_still(k: Kept, j: int, moves_degC: float) -> None:
-    """An output stands still, or shows noise alone, while its forecast moves: its sensor, or its heater."""
+    """Records that an output stands still, or shows only noise, while its forecast moves. The cause is its
+    sensor, or its heater."""
     say(k, STILL if k.repeats[j] >= STILL_AFTER // 2 else DEAF, j, moves_degC)
 
 
 def same_degC(s: Supervision, k: Kept) -> np.ndarray:
-    """By how many degC (p,) a reading may vary that stands still."""
+    """Returns by how many degC (p,) a reading that stands still may vary."""
     return np.maximum(SAME_STEPS * known_steps(k.quantum), SAME_NOISE * s.noise_degC)
 
 
 def judge_sensors(
     s: Supervision, k: Kept, moves: np.ndarray, still: np.ndarray, honest: np.ndarray, noise: np.ndarray
 ) -> None:
-    """Says which sensors stand still (K, p) as long as nothing that is no fault, which leaves `honest` (K, m)
-    of what they miss, explains that as well; `noise` (K, p) of it is none of anything."""
+    """Records which sensors stand still (K, p), unless a cause that is no fault explains the readings as
+    well. `honest` (K, q): the squared error that such causes leave; `noise` (K, p): the part of it that no
+    cause explains."""
     age = np.maximum(k.age, 1)[:, None]
     still = still & (np.abs(moves) >= SAME_STEPS * (k.most - k.least))
     for j in np.flatnonzero(still.any(axis=0)):
@@ -569,8 +581,8 @@ def judge_sensors(
         steady = k.total[1, :, j] - k.total[0, :, j] ** 2 / age[:, 0]
         floor = noise[:, j] + MISFIT**2 * square + 1e-12
         better = age[:, 0] * np.log(honest[:, heaters].min(axis=1) / np.maximum(steady, floor))
-        # what moves a heater is a reading that moved: nothing honest keeps one equal meanwhile, unless its
-        # steps hide what the law makes up for
+        # a heater moves because a reading moved, so a healthy sensor cannot stay equal meanwhile, unless its
+        # steps hide what the law compensates
         equal = (k.repeats[j] >= age[:, 0]) & (known_steps(k.quantum)[j] <= s.noise_degC[j])
         clear = still[:, j] & ((better >= CLEARER) | equal)
         if clear.any():
@@ -579,9 +591,9 @@ def judge_sensors(
 
 
 def forget(s: Supervision, k: Kept) -> None:
-    """Causes that are gone: after BACK_S without them, or, if the heaters are off for them, as soon as the
-    output moves as forecast again. A heater is tried again RETURNS times an hour; from then on a person is
-    waited for."""
+    """Removes causes that are gone: BACK_S after they were last present; or, if the heaters are off because
+    of them, as soon as the output moves as forecast again. A heater is tried again RETURNS times an hour;
+    after that a person must acknowledge."""
     if not k.counters[ACTIVE]:
         return
     gone = (k.since >= 0) & (k.clock_s[1] - k.last > BACK_S)
@@ -603,8 +615,8 @@ def forget(s: Supervision, k: Kept) -> None:
 
 
 def follow(s: Supervision, k: Kept, y: np.ndarray, applied: np.ndarray | None, samples: int) -> np.ndarray:
-    """One sample of outputs y (p,), inputs `applied` since the one before, none of `samples` in manual; y
-    (p,) with what does not count as forecast."""
+    """Processes one sample of outputs y (p,), with inputs `applied` since the last one; `samples` is 0 in
+    manual. Returns y (p,), with the forecast in place of readings that do not count."""
     u = k.asked if applied is None else np.where(np.isfinite(applied), applied, k.asked)
     u = np.minimum(np.maximum(u, s.low), s.high) - k.forward
     silent = np.isnan(k.y)
@@ -640,8 +652,9 @@ def follow(s: Supervision, k: Kept, y: np.ndarray, applied: np.ndarray | None, s
 
 
 def choose_mode(s: Supervision, k: Kept) -> int:
-    """The safe mode of the causes that are there: the heaters go off if a sensor is in doubt, or a heater is
-    and its sensor has not moved as forecast for CLEARED_S; otherwise the machine's own control takes over."""
+    """Returns the safe mode for the present causes. The heaters go off if a sensor is in doubt, or if a
+    heater is in doubt and its sensor has not moved as forecast for CLEARED_S. Otherwise the machine's own
+    control takes over."""
     if not k.counters[ACTIVE]:
         return LAW
     doubtful = (k.since[[OPEN, STILL, DEAF, ON]] >= 0).any()
@@ -656,7 +669,7 @@ def choose_mode(s: Supervision, k: Kept) -> int:
 
 
 def sentence(s: Supervision, machine: Machine, kind: int, signal: int, amount: float) -> str:
-    """Why, in one sentence."""
+    """Returns the reason in one sentence."""
     if kind in OF_INPUT:
         heater, zone = machine.inputs[signal].name, machine.outputs[s.of_input[signal]].name
     else:
@@ -681,10 +694,10 @@ def sentence(s: Supervision, machine: Machine, kind: int, signal: int, amount: f
 
 
 class Supervised:
-    """A controller on one machine with its supervisor, a sample at a time.
+    """A controller on one machine with its supervisor, one sample at a time.
 
-    As law.RunningController: in manual, `watch` each sample; then `hand_over` once, then `step` each
-    sample. Where a cause asks for a safe mode, the law watches, and takes over again without a bump when the
+    Use it as law.RunningController: in manual, `watch` each sample; then `hand_over` once, then `step` each
+    sample. If a cause requires a safe mode, the law only watches. It takes over again without a bump when the
     cause has been gone for its declared time, or after `acknowledge`.
     """
 
@@ -703,14 +716,14 @@ class Supervised:
         self._in_reach = np.full(len(exported.machine.outputs), np.nan)
 
     def tell(self, disturbances: np.ndarray) -> None:
-        """The measured disturbances (q,) from this sample on, in the machine's order, NaN where one gives no
-        number. Raises ValueError for another number of them."""
+        """Sets the measured disturbances (q,) from this sample on, in the machine's order, NaN if one gives
+        no number. Raises ValueError for another number of them."""
         told = numbers(disturbances, (len(self.exported.machine.disturbances),), "disturbances")
         self.law.tell(told)
 
     def watch(self, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> None:
-        """One sample in manual, as RunningController has it; what is wrong is told by the first `step`.
-        Raises ValueError as `step` does, and if inputs u (m,) are not finite; it then remembers nothing."""
+        """Processes one sample in manual, as RunningController; faults are reported by the first `step`.
+        Raises ValueError as `step` does, or if inputs u (m,) are not finite, and then remembers nothing."""
         k = self.kept
         y = self._accepted(y, r)
         u = numbers(u, k.asked.shape, INPUTS, finite=True)
@@ -722,11 +735,11 @@ class Supervised:
         self.law.watch(u, filled, r_now)
 
     def hand_over(self, y: np.ndarray) -> None:
-        """From manual to the law without a bump, at outputs y (p,) measured now."""
+        """Switches from manual to the law without a bump, at outputs y (p,) measured now."""
         self.law.hand_over(np.where(np.isfinite(y), y, self.kept.expected))
 
     def acknowledge(self) -> None:
-        """A person has mended what was wrong: every cause is forgotten."""
+        """Forgets every cause, after a person has repaired the fault."""
         k = self.kept
         k.since[:] = k.last[:] = -1.0
         k.counters[ACTIVE] = 0
@@ -737,10 +750,10 @@ class Supervised:
     def step(
         self, y: np.ndarray, r: np.ndarray | Reference, t_s: float, applied: np.ndarray | None = None
     ) -> Decision:
-        """What to apply from outputs y (p,) measured at t_s on the machine's clock, NaN where a sensor gives
-        none, under reference r; `applied` (m,) are the inputs that acted since the last sample, where the
-        machine reads them back. Raises ValueError for another number of them, before any watch, and where r
-        or t_s is not finite, and remembers nothing."""
+        """Returns the inputs to apply for outputs y (p,) measured at t_s on the machine's clock, NaN if a
+        sensor gives none, under reference r. `applied` (m,): inputs that acted since the last sample, if the
+        machine reads them back. Raises ValueError for another number of them, before any `watch`, or if r or
+        t_s is not finite, and then remembers nothing."""
         s, k = self.supervision, self.kept
         y = self._accepted(y, r)
         numbers(t_s, (), "time in s", finite=True)
@@ -760,14 +773,14 @@ class Supervised:
         return Decision(u.copy(), MODES[mode], self._causes(t_s) if mode != LAW else ())
 
     def _accepted(self, y: np.ndarray, r: np.ndarray | Reference) -> np.ndarray:
-        """Outputs y (p,), NaN where a sensor gives none. Raises ValueError for another number of them, or if
-        the reference r is not p finite numbers."""
+        """Returns outputs y (p,), NaN if a sensor gives none. Raises ValueError for another number of them,
+        or if the reference r is not p finite numbers."""
         p = self.kept.y.shape
         numbers(r.H @ r.w0 if isinstance(r, Reference) else r, p, REFERENCES, finite=True)
         return numbers(y, p, "temperatures in °C")
 
     def _drive(self, y: np.ndarray, r: np.ndarray | Reference, r_now: np.ndarray) -> tuple[np.ndarray, int]:
-        """Inputs of the mode, and the mode; the law watches where it does not drive."""
+        """Returns the inputs of the mode, and the mode; in a safe mode the law only watches."""
         k, mode = self.kept, choose_mode(self.supervision, self.kept)
         before, n, forward = k.counters[MODE], int(k.counters[RUNS]), self.law.forward
         if mode == LAW:
@@ -782,7 +795,7 @@ class Supervised:
         return u, mode
 
     def _safe(self, mode: int, before: int, y: np.ndarray, r: np.ndarray, n: int) -> np.ndarray:
-        """Inputs of a safe mode; off, too, if there is no control of the machine's own."""
+        """Returns the inputs of a safe mode. They are off, too, if the machine has no control of its own."""
         if mode == OFF or self.own is None:
             return self.exported.controller.limits.low.copy()
         if before != OWN:
@@ -794,7 +807,8 @@ class Supervised:
         return self.own.step(y, r, n)
 
     def _target(self, r: np.ndarray | Reference) -> np.ndarray:
-        """The reference r (p,) now, and whether the inputs can hold it."""
+        """Returns the reference r (p,) now. For a new reference, also works out whether the inputs can hold
+        it."""
         mine = self._reference
         r = r if isinstance(r, Reference) else np.asarray(r, float)
         if mine is None or not same(mine, r):
@@ -810,11 +824,11 @@ class Supervised:
         return mine.H @ self._w
 
     def _out(self) -> bool:
-        """Whether an output's reference is out of reach."""
+        """Returns whether an output's reference is out of reach."""
         return bool((self._beyond > self.supervision.reach_degC).any())
 
     def _causes(self, t_s: float) -> tuple[Cause, ...]:
-        """Every cause that is there, the first of KINDS first."""
+        """Returns every present cause, in the order of KINDS."""
         k, machine, causes = self.kept, self.exported.machine, []
         for kind, signal in zip(*np.nonzero(k.since >= 0), strict=True):
             names = machine.inputs if kind in OF_INPUT else machine.outputs
@@ -824,7 +838,7 @@ class Supervised:
         return tuple(causes)
 
     def saved(self) -> dict[str, np.ndarray]:
-        """All that it remembers, as arrays. Raises ValueError before the first watch."""
+        """Returns all that it remembers, as arrays. Raises ValueError before the first watch."""
         arrays = {f"law.{name}": part for name, part in self.law.saved().items()}
         if self.own is not None and self.kept.counters[MODE] == OWN:
             arrays |= {f"own.{name}": part for name, part in self.own.saved().items()}
@@ -834,8 +848,8 @@ class Supervised:
         return arrays | {f"aim.{name}": np.array(part) for name, part in aimed.items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Goes on from what another of the same controller `saved`. Raises ValueError where its arrays are
-        not of this controller, and stays as it was."""
+        """Continues from what another supervisor of the same controller `saved`. Raises ValueError if the
+        arrays belong to another controller, and then changes nothing."""
         memory = self.kept._asdict()
         for name, part in memory.items():
             if name not in arrays or np.shape(arrays[name]) != part.shape:

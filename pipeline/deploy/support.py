@@ -1,28 +1,31 @@
-"""Where a recording is off the support of what a controller was learned from and judged on: temperatures and
-commands beyond those of the record, and outputs that no plant of its spread would have had.
+"""Finds where a recording is outside the conditions (the support) for which a controller was learned and
+judged: temperatures and commands beyond those of the record, and outputs that no plant of its spread would
+give.
 
-Plants of the spread forecast the outputs a few samples ahead, each from its own observer and with the inputs
-that were applied. f_k (p,) is what plant k of K forecasts more than their mean, e (p,) the machine's miss of
-that mean. Two questions follow.
+Plants of the spread forecast the outputs a few samples ahead, each from its own observer and with the applied
+inputs. f_k (p,) is how much more plant k of K forecasts than the mean of all, and e (p,) the machine's
+deviation from that mean. Two questions follow.
 
-Sample by sample: is e larger than the plants differ? S (p, p) is the covariance of the f_k, R what the noise
-of the sensors adds:
+Sample by sample: is e larger than the plants differ? S (p, p) is the covariance of the f_k, R the part that
+sensor noise adds:
 
     d^2 = e' (S + R)^-1 e
 
 A forecast is off if d is larger than nearly always on the controller's own plants.
 
-For the log as a whole: the machine is one plant all the time. If it were of the spread, one mixture c (K,)
-would explain all its misses, with a rest as large as on honest logs:
+For the log as a whole: the machine is one plant all the time. If it belonged to the spread, one mixture c
+(K,) would explain all its deviations, with a rest as large as on honest logs:
 
     e = sum_k c_k f_k + rest,   c ~ N(0, I / (K - 1))
 
 The most likely c is a ridge regression. `misfit` is the mean square of the rest, `departure` the mean square
-of c, in units of the spread. Swapped sensors misfit; a gain far from the spread departs.
+of c, in units of the spread. Swapped sensors give a large misfit; a gain far from the spread gives a large
+departure.
 
-Every observer takes a steady disagreement for weather (another ambient, more heat lost). So a log in which
-nothing moves cannot say which sensor is which, or what a heater's percent is worth: it is judged by its
-ranges alone."""
+Every observer takes a constant disagreement for a change of surroundings (another ambient, more heat lost).
+So a log in which nothing moves cannot show which sensor is which, or what a heater's percent means. It is
+judged by its ranges alone.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,24 +44,24 @@ from pipeline.temperature.test_set import panel
 
 TEMPERATURE, COMMAND, FORECAST = 1, 2, 4
 BEYOND = 0.1  # of a range: signals may leave it by so much
-NEARLY_ALL = 0.99  # of the forecasts on honest plants are no further off
-HONEST = 0.96  # of honest logs keep every limit
-LEAST_SHARE = 0.05  # of a log, beyond whose ranges it is off
-LEAST_FIGURES = (0.05, 1.5, 1.0)  # below which no log is off, whatever the honest ones were
+NEARLY_ALL = 0.99  # fraction of the forecasts on honest plants within the limit
+HONEST = 0.96  # fraction of honest logs that keep every limit
+LEAST_SHARE = 0.05  # fraction of a log outside the ranges, above which the log is off support
+LEAST_FIGURES = (0.05, 1.5, 1.0)  # least limits of figures, whatever the honest logs show
 FEW, FEW_LOGS = 1.5, 30
 ENOUGH = 100
-STILL = 3.0  # of `rest`, within which outputs stay, and would by their inputs, where nothing moves
+STILL = 3.0  # times `rest`: if outputs, measured and computed from inputs, vary less, nothing moves
 TAU, DRIFT, LEAK, UNHURRIED = 0.2, 0.06, 1e-4, 16  # of the observers, as of the governor's
-AT_ONCE = 4  # forecasts begin so often within the steps that one goes
-MOST_SAMPLES = 60_000  # of a long log forecasts are judged in stretches, so many samples in all
+AT_ONCE = 4  # forecasts that run at the same time
+MOST_SAMPLES = 60_000  # longer logs are judged in stretches with this many samples in total
 STRETCH = 2_000
 BLOCK = 1 << 17  # samples whose states are held at once, of all plants
 
 
 class Support(NamedTuple):
-    """low, high (p,) in °C of temperatures and (m,) in percent of commands; `spread` are the plants that
-    forecast, `steps` samples ahead, with sensors' noise (p,) in °C; `furthest` d is allowed; `rest` (p,) in
-    °C what honest logs leave unexplained; `allowed` (3,) the limits of a log's `figures`."""
+    """Low and high limits of temperatures (p,) in °C and of commands (m,) in percent. `spread`: the plants
+    that forecast `steps` samples ahead; `noise` (p,): of the sensors in °C; `furthest`: largest allowed d;
+    `rest` (p,): in °C, what honest logs leave unexplained; `allowed` (3,): limits of a log's `figures`."""
 
     temperature_low: np.ndarray
     temperature_high: np.ndarray
@@ -73,8 +76,8 @@ class Support(NamedTuple):
 
 
 class FamilyForecasts(NamedTuple):
-    """Forecasts of a log: the sample at which each begins (a,), what each plant forecasts more than their
-    mean (K, a, p), and the machine's miss of the mean (a, p), in °C."""
+    """Forecasts of a log: `start` (a,), the sample at which each begins; `apart` (K, a, p), how much more
+    each plant forecasts than their mean; `miss` (a, p), the machine's deviation from the mean, in °C."""
 
     start: np.ndarray
     apart: np.ndarray
@@ -82,14 +85,15 @@ class FamilyForecasts(NamedTuple):
 
 
 def horizon(spread: Sequence[Plant]) -> int:
-    """Samples after which an input has shown what it does: the furthest instant of the governor, of the
-    middle one of the plants. Further ahead weather and doubt about the plants cover what is wrong."""
+    """Returns the number of samples after which an input has shown its effect: the furthest instant of the
+    governor, for the median plant. Further ahead, surroundings and uncertainty of the plants would hide
+    errors."""
     return int(np.median([instants([one])[-1] for one in spread]))
 
 
 def forecasts(observers: "Observers", log: GaplessLog, steps: int) -> FamilyForecasts:
-    """Forecasts over `steps` samples, AT_ONCE of them under way at a time; none in the first 2 `steps`, while
-    the observers find the machine."""
+    """Returns forecasts over `steps` samples, AT_ONCE of them running at a time. None starts in the first 2
+    `steps`, while the observers find the machine's state."""
     start = np.arange(2 * steps, len(log.u) - steps, max(steps // AT_ONCE, 1))
     outputs = _forecast(observers, log, start, steps)
     mean = outputs.mean(axis=0)
@@ -97,24 +101,25 @@ def forecasts(observers: "Observers", log: GaplessLog, steps: int) -> FamilyFore
 
 
 def distances(run: FamilyForecasts, noise: np.ndarray) -> np.ndarray:
-    """d (a,) of every forecast, with sensors' noise (p,)."""
+    """Returns d (a,) of every forecast, with sensor noise (p,)."""
     S = np.einsum("kai,kaj->aij", run.apart, run.apart) / (len(run.apart) - 1)
     near = S + np.diag((NOISES * noise) ** 2)
     whitened = np.linalg.solve(near, run.miss[..., None])[..., 0]
     return np.sqrt(np.einsum("ai,ai->a", run.miss, whitened))
 
 
-NOISES = 2.0  # deviations: of the sample that is forecast, and of those from which
+NOISES = 2.0  # factor on the noise: that of the forecast sample, and of those from which it is forecast
 
 
 def fit_mixture(run: FamilyForecasts, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The mixture c (K,) of the plants that explains all forecasts best, each output in units of `rest` (p,),
-    and the rest (a, p) in °C:
+    """Returns the mixture c (K,) of the plants that explains all forecasts best, with each output in units of
+    `rest` (p,), and the rest (a, p) in °C:
 
         c = (w F'F + (K - 1) I)^-1 w F'e
 
-    The rest is alike from one forecast to the next: a long log counts as one of ENOUGH forecasts, w = ENOUGH
-    / their number. Otherwise little errors that never change would pass for another machine."""
+    The rest is similar from one forecast to the next, so a long log counts as one of ENOUGH forecasts, w =
+    ENOUGH / their number. Otherwise small constant errors would look like another machine.
+    """
     K = len(run.apart)
     F, weight = (run.apart / rest).reshape(K, -1), min(ENOUGH / len(run.start), 1.0)
     c = np.linalg.solve(weight * F @ F.T + (K - 1) * np.eye(K), weight * F @ (run.miss / rest).ravel())
@@ -122,7 +127,8 @@ def fit_mixture(run: FamilyForecasts, rest: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def figures(run: FamilyForecasts, noise: np.ndarray, furthest: float, rest: np.ndarray) -> np.ndarray:
-    """Of a log: the share of forecasts further off than `furthest`, its misfit, and its departure."""
+    """Returns for a log the fraction of forecasts further off than `furthest`, its misfit, and its
+    departure."""
     if not len(run.start):
         return np.zeros(3)
     c, left = fit_mixture(run, rest)
@@ -132,9 +138,9 @@ def figures(run: FamilyForecasts, noise: np.ndarray, furthest: float, rest: np.n
 
 
 class Observers(NamedTuple):
-    """Observers L of the states [x; w] of K plants, one behind the other: w (p,) in °C a step is a drift that
-    the plant does not explain, so that a steady disagreement (another ambient, more heat lost) vanishes from
-    its forecasts, as the governor's. `first` (K, n, p) finds x of the first outputs."""
+    """Observers L of the states [x; w] of K plants, stacked. w (p,) in °C a step is a drift that the plant
+    does not explain. It removes a constant disagreement (another ambient, more heat lost) from the forecasts,
+    as the governor's does. `first` (K, n, p) finds x from the first outputs."""
 
     A: np.ndarray
     B: np.ndarray
@@ -146,14 +152,14 @@ class Observers(NamedTuple):
 
 
 def design_observers(spread: Sequence[Plant], steps: int) -> Observers:
-    """The observers of plants of one order: the same for every log."""
+    """Returns the observers of plants of one order; they are the same for every log."""
     return Observers(
         *(np.stack(part) for part in zip(*(_design_observer(one, steps) for one in spread), strict=True))
     )
 
 
 def _design_observer(plant: Plant, steps: int) -> tuple[np.ndarray, ...]:
-    """The governor's observer, slower for forecasts over more `steps`."""
+    """Returns the governor's observer, made slower for forecasts over more `steps`."""
     slower = max(steps / UNHURRIED, 1.0)
     A, C, M = observer(plant, tau=TAU * slower**2, drift=DRIFT / slower, leak=LEAK, lags=steps)
     none = np.zeros((plant.p, plant.m))
@@ -162,8 +168,8 @@ def _design_observer(plant: Plant, steps: int) -> tuple[np.ndarray, ...]:
 
 
 def scanned(A: np.ndarray, drive: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """z (..., T + 1, q) with z(0) = first (..., q) and z(t+1) = A z(t) + drive(t), A (..., q, q), drive
-    (..., T, q)."""
+    """Returns z (..., T + 1, q) with z(0) = first (..., q) and z(t+1) = A z(t) + drive(t); A (..., q, q),
+    drive (..., T, q)."""
     *sides, T, q = drive.shape
     z = np.empty((*sides, T + 1, q))
     z[..., 0, :] = first
@@ -173,7 +179,7 @@ def scanned(A: np.ndarray, drive: np.ndarray, first: np.ndarray) -> np.ndarray:
 
 
 def _forecast(observers: Observers, log: GaplessLog, start: np.ndarray, steps: int) -> np.ndarray:
-    """Outputs (K, a, p) that the plants forecast `steps` samples after each start (a,)."""
+    """Returns the outputs (K, a, p) that the plants forecast `steps` samples after each start (a,)."""
     K, p = observers.d.shape
     away = (log.y[0] - observers.d)[..., None]
     x = np.concatenate([np.matmul(observers.first, away)[..., 0], np.zeros((K, p))], axis=1)
@@ -196,9 +202,9 @@ def support(
     noise_degC: np.ndarray,
     seen: Sequence[GaplessLog] = (),
 ) -> Support:
-    """Of logs of the controller's own plants, whose sensors have noise (p,), and of recordings of the machine
-    that were `seen`: these are on support whatever the plants say. Raises ValueError where no log is long
-    enough."""
+    """Returns the support from logs of the controller's own plants, with sensor noise (p,), and from
+    recordings of the machine that were `seen`; these are on support whatever the plants forecast. Raises
+    ValueError if no log is long enough."""
     steps = horizon(spread)
     observers, noise = design_observers(spread, steps), np.asarray(noise_degC, float)
     groups = [
@@ -231,8 +237,8 @@ def support(
 
 
 def _pieces(log: GaplessLog, steps: int) -> list[GaplessLog]:
-    """A recording whole, and in up to PIECES parts, each long enough to be judged by itself: what a mixture
-    may be, and leave, differs with the length."""
+    """Returns a recording whole, and in up to PIECES parts, each long enough to be judged alone. The limits
+    of a mixture and of its rest depend on the length."""
     count = min(max(len(log.u) // (5 * steps), 1), PIECES)
     parts = [GaplessLog(*part) for part in zip(*(np.array_split(one, count) for one in log), strict=True)]
     return [log, *parts] if count > 1 else parts
@@ -242,8 +248,8 @@ PIECES = 8
 
 
 def _rest(runs: Sequence[FamilyForecasts], noise: np.ndarray) -> np.ndarray:
-    """Deviation (p,) in °C of what mixtures leave of honest logs; at least the sensors' noise, of which they
-    leave less where forecasts are few."""
+    """Returns the standard deviation (p,) in °C of what mixtures leave of honest logs. It is at least the
+    sensors' noise; with few forecasts mixtures leave less than that."""
     rest, least = NOISES * noise, noise + 1e-9
     for _ in range(3):
         left = [(fit_mixture(run, np.maximum(rest, least))[1] ** 2).mean(axis=0) for run in runs]
@@ -252,8 +258,9 @@ def _rest(runs: Sequence[FamilyForecasts], noise: np.ndarray) -> np.ndarray:
 
 
 def _seldom_above(found: np.ndarray) -> np.ndarray:
-    """Limits (k,), all at one quantile, of which few new logs pass any: of many honest ones' figures (n, k)
-    those that a share HONEST of them keep; of few, the largest and more."""
+    """Returns limits (k,), all at one quantile, that few new logs exceed, from the figures (n, k) of honest
+    logs. With many logs, a fraction HONEST keeps all limits; with few, the limits are FEW times the largest
+    figures."""
     n = len(found)
     if n < FEW_LOGS:
         return FEW * found.max(axis=0)
@@ -263,10 +270,10 @@ def _seldom_above(found: np.ndarray) -> np.ndarray:
 
 
 class SupportCheck(NamedTuple):
-    """What is said of a log: by sample (T,) the sum of TEMPERATURE, COMMAND and FORECAST; its `figures` over
-    what they may be (3,), above 1 off support, 0 where it is judged by its ranges alone; the share of samples
-    outside the ranges; `abstains`: a replay of it says nothing of this controller; `still`: so little moves
-    that it cannot be told whether signals are wired or scaled as they were; `short`: too short for a
+    """Result for a log. `off` (T,): by sample the sum of TEMPERATURE, COMMAND and FORECAST; `figures` (3,):
+    relative to their limits, above 1 off support, 0 if the log is judged by its ranges alone; `outside`:
+    fraction of samples outside the ranges; `abstains`: a replay of the log says nothing of this controller;
+    `still`: so little moves that swapped or rescaled signals could not be detected; `short`: too short for a
     forecast."""
 
     off: np.ndarray
@@ -278,8 +285,8 @@ class SupportCheck(NamedTuple):
 
 
 def check_log(within: Support, log: GaplessLog, observers: Observers) -> SupportCheck:
-    """Where a log is off support, by the observers of its plants. One too short for a forecast is judged by
-    its ranges alone."""
+    """Returns where a log is off support, by the observers of its plants. A log too short for a forecast is
+    judged by its ranges alone."""
     off = np.zeros(len(log.u), np.int8)
     for low, high, values, kind in (
         (within.temperature_low, within.temperature_high, log.y, TEMPERATURE),
@@ -305,7 +312,7 @@ def check_log(within: Support, log: GaplessLog, observers: Observers) -> Support
 
 
 def _moves(within: Support, log: GaplessLog) -> bool:
-    """Whether an output moved, or its inputs would have moved it on a plant of the spread."""
+    """Returns whether an output moved, or its inputs would have moved it on a plant of the spread."""
     plant = within.spread[0]
     drive = (log.u - log.u.mean(axis=0)) @ plant.B.T
     answer = scanned(plant.A, drive, np.zeros(plant.n)) @ plant.C.T
@@ -313,7 +320,8 @@ def _moves(within: Support, log: GaplessLog) -> bool:
 
 
 def reasons(checked: SupportCheck) -> list[str]:
-    """Why a log is off support, the strongest reason first; or what could not be told of it."""
+    """Returns why a log is off support, the strongest reason first, and what could not be determined from
+    it."""
     found = [(checked.outside / LEAST_SHARE, OUTSIDE)] + list(zip(checked.figures, OF_FIGURES, strict=True))
     over = sorted((one for one in found if one[0] > 1), key=lambda one: -one[0])
     unknown = [text for so, text in ((checked.still, STILL_TOLD), (checked.short, SHORT_TOLD)) if so]
@@ -338,7 +346,8 @@ SHORT_TOLD = (
 
 
 def _stretches(log: GaplessLog) -> list[tuple[int, GaplessLog]]:
-    """The log whole, or of a long one stretches evenly apart, each with its first sample."""
+    """Returns the whole log, or evenly spaced stretches of a long one, each with the index of its first
+    sample."""
     T = len(log.u)
     if T <= MOST_SAMPLES:
         return [(0, log)]
@@ -356,7 +365,7 @@ def forecasting_plants(
 
 
 def honest_logs(made: Exported, half: panel.Cases, limits: ActuatorLimits) -> list[GaplessLog]:
-    """Logs of cases of the judging half under the controller as deployed, from the hold on."""
+    """Returns logs of cases of the judging half with the controller as deployed, including the hold."""
     aims = panel.aims(made.controller.law, panel.rests(made.model, half, limits), half)
     run, held = panel.rolled_out(made.controller, half, aims), panel.held_readings(half)[:-1]
     logs = []
@@ -375,7 +384,7 @@ SUPPORT = "support.safetensors"
 
 
 def write_support(folder: Path, within: Support, controller_sha256: str) -> None:
-    """support.safetensors of a controller's folder."""
+    """Writes support.safetensors of a controller's folder."""
     plants = {
         f"spread.{name}": np.stack([np.asarray(getattr(one, name), float) for one in within.spread])
         for name in within.spread[0]._fields
@@ -387,7 +396,7 @@ def write_support(folder: Path, within: Support, controller_sha256: str) -> None
 
 
 def read_support(folder: Path, made: Exported) -> Support | None:
-    """What `write_support` wrote; None where there is none. Raises ValueError where it is of another
+    """Returns what `write_support` wrote; None if there is none. Raises ValueError if it belongs to another
     controller."""
     if not artifacts.exists(folder / SUPPORT):
         return None

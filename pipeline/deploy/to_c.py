@@ -1,10 +1,10 @@
-"""A controller as C99 without heap: a folder that `make test` compiles and checks.
+"""Exports a controller as C99 without heap: a folder that `make test` compiles and checks.
 
-law.c and controller.c are the same for every machine, and are read beside law.py and supervise.py,
-whose letters they keep. machine.h says which machine they are made for; tables.h holds its numbers, each as
-the shortest decimal that reads back bit by bit. golden.csv holds what the object of `pipeline` did, and
-test_controller.c asks for the same within 1e-9 of each signal's range. With -DBEADLINE_SINGLE a `real` is a
-float, for boards; its tolerance stands in test_controller.c.
+law.c and controller.c are the same for every machine. They mirror law.py and supervise.py, with the same
+letters. machine.h names the machine that they are made for; tables.h holds its numbers, each as the shortest
+decimal that reads back identically. golden.csv holds the results of the Python object, and test_controller.c
+requires the same within 1e-9 of each signal's range. With -DBEADLINE_SINGLE a `real` is a float, for boards;
+its tolerance is in test_controller.c.
 """
 
 import re
@@ -33,22 +33,23 @@ TEMPLATES = Path(__file__).with_name("templates")
 PARTS = ("law.h", "law.c", "supervisor.h", "supervisor.c")
 COPIED = ("test_controller.c", "Makefile")
 WIDTH = 110
-# the governor's bound of rounding errors in °C: a forecast of 250 °C in single precision is sure to 3e-5
+# the governor's bound of rounding errors in °C: a forecast of 250 °C in single precision is accurate to 3e-5
 SINGLE_EXACT = "BY_PRECISION({}, 3e-5)"
-# of several columns least_squares takes at most INPUTS, which gcc does not see: of one it warns of a second
+# least_squares takes at most INPUTS columns; gcc does not see this, and with one input it warns of a second
+# column
 ONE_INPUT = '#if defined(__GNUC__)\n#pragma GCC diagnostic ignored "-Warray-bounds"\n#endif\n\n'
 
 
 def files(exported: Exported, certificate: Certificate, golden: str) -> dict[str, str]:
-    """The folder's files, name to text; `golden` is golden.csv (vectors.py). Raises ValueError where the
-    certificate was not passed, or is of another controller."""
+    """Returns the folder's files, name to text; `golden` is golden.csv (vectors.py). Raises ValueError if the
+    certificate was not passed, or belongs to another controller."""
     check(exported)
     check_certificate(exported, certificate)
     return code(exported, sha256(certificate)) | {"golden.csv": golden}
 
 
 def code(exported: Exported, certificate_sha256: str) -> dict[str, str]:
-    """The folder's files without golden.csv."""
+    """Returns the folder's files without golden.csv."""
     return {name: _template(name) for name in COPIED} | {
         "controller.h": _assembled("controller.h"),
         "controller.c": _assembled("controller.c"),
@@ -64,7 +65,7 @@ def _template(name: str) -> str:
 
 
 def _assembled(name: str) -> str:
-    """A file with its parts in place, each marked @part@."""
+    """Returns a file with its parts inserted, each marked @part@."""
     text = _template(name)
     for part in PARTS:
         text = text.replace(f"@{part}@", _template(part).rstrip())
@@ -72,7 +73,8 @@ def _assembled(name: str) -> str:
 
 
 def readme(exported: Exported, certificate_sha256: str) -> str:
-    """README.txt: what it is for, how it is called, and how its stack and its steps are measured."""
+    """Returns README.txt: purpose, how to call the controller, and how its stack and its time for a step are
+    measured."""
     signals = "".join(
         f"{kind:<8}{one.name}, {one.unit}, {one.low:g} to {one.high:g}\n"
         for kind, group in (("input", exported.machine.inputs), ("output", exported.machine.outputs))
@@ -97,7 +99,7 @@ def readme(exported: Exported, certificate_sha256: str) -> str:
 
 
 def number(value: float) -> str:
-    """The shortest decimal that reads back as the same double."""
+    """Returns the shortest decimal that reads back as the same double."""
     if np.isinf(value):
         return "-INFINITY" if value < 0 else "INFINITY"
     return repr(float(value))
@@ -121,8 +123,8 @@ def _braced(array: np.ndarray, depth: int) -> str:
 
 
 def table(name: str, values: np.ndarray, *, flat: bool = False, of: str = "real") -> str:
-    """`static const real name[a][b] = {...};`; `flat`: row after row; `of`: the type. C has no empty array:
-    without a number, one 0 stands."""
+    """Returns `static const real name[a][b] = {...};`. `flat`: row after row; `of`: the type. C has no empty
+    array, so an array without numbers gets one 0."""
     array = np.asarray(values, float)
     array = array.reshape(-1) if flat or not array.size else array
     array = array if array.size else np.zeros(1)
@@ -131,7 +133,7 @@ def table(name: str, values: np.ndarray, *, flat: bool = False, of: str = "real"
 
 
 def define(name: str, value: float | int | str, real: str = "REAL({})") -> str:
-    """`#define name value`; `real`: how a float is written, which has the precision of the build."""
+    """Returns `#define name value`. `real`: format of a float, with the precision of the build."""
     whole = f'"{value}"' if isinstance(value, str) else str(value)
     text = real.format(number(value)) if isinstance(value, float) else whole
     return f"#define {name} {text}\n"
@@ -141,8 +143,9 @@ def define(name: str, value: float | int | str, real: str = "REAL({})") -> str:
 
 
 def sizes(exported: Exported) -> dict[str, int]:
-    """Lengths of the arrays: `watched` states of a governor's member, `instants` it looks ahead an output;
-    `watch` states of the supervisor's observer, `windows` of its forecasts, `pairs` of input and output."""
+    """Returns lengths of the arrays. `watched`: states of a governor's member; `instants`: that it looks
+    ahead for each output; `watch`: states of the supervisor's observer; `windows`: its forecasts; `pairs`: of
+    input and output."""
     m, p = exported.controller.law.D.shape
     laws = [one for one in (exported.controller, exported.fallback) if one is not None]
     family, watched = governor_of(exported), exported.supervision
@@ -166,7 +169,7 @@ def sizes(exported: Exported) -> dict[str, int]:
 
 
 def governor_of(exported: Exported) -> Governor | None:
-    """The governor of law and fallback, which share one. Raises ValueError where they have two."""
+    """Returns the governor that law and fallback share. Raises ValueError if they have different ones."""
     found = [one.governor for one in (exported.controller, exported.fallback) if one is not None]
     found = [one for one in found if one is not None]
     for other in found[1:]:
@@ -212,7 +215,7 @@ def machine_header(exported: Exported, certificate_sha256: str) -> str:
 
 
 def tables(exported: Exported) -> str:
-    """Laws, target, governor and supervisor in numbers."""
+    """Returns tables.h: law, target, governor and supervisor as numbers."""
     own = exported.fallback
     return "".join(
         [
@@ -233,7 +236,7 @@ def tables(exported: Exported) -> str:
 
 
 def _forward(name: str, exported: Exported, *, of: str = "real") -> str:
-    """Gain, mean and lead of what is fed forward, as law.FeedForward has them."""
+    """Returns gain, mean and lead of the feed-forward, as in law.FeedForward."""
     m, q = len(exported.machine.inputs), len(exported.machine.disturbances)
     forward = exported.controller.forward or FeedForward(np.zeros((m, q)), np.zeros(q), np.zeros(q))
     gain = forward.gain if q else np.zeros((m, 1))
@@ -242,7 +245,7 @@ def _forward(name: str, exported: Exported, *, of: str = "real") -> str:
 
 
 def plant_header(exported: Exported) -> str:
-    """test_plant.h: the model, which test_controller.c heats."""
+    """Returns test_plant.h: the model that test_controller.c heats."""
     model = strictly_proper(exported.model)
     text = "/* The model that the test heats: x(t+1) = A x + B u + b, y = C x + d. Do not edit. */\n\n"
     arrays = {"A": model.A, "B": model.B, "C": model.C, "b": model.b, "d": model.d}
@@ -253,7 +256,7 @@ def plant_header(exported: Exported) -> str:
 
 
 def _aiming(exported: Exported) -> str:
-    """What feasible_target needs: outputs at rest are aim_rows u + aim_rest + aim_d."""
+    """Returns what feasible_target needs: outputs at rest are aim_rows u + aim_rest + aim_d."""
     limits = exported.controller.limits
     rows, rest = at_rest(exported.model)
     narrowest = float((limits.high - limits.low).min())
@@ -275,13 +278,14 @@ def _aiming(exported: Exported) -> str:
 
 
 def at_rest(model: Plant) -> tuple[np.ndarray, np.ndarray]:
-    """G (p, m) and g (p,): the outputs on which constant inputs u rest are G u + g + d."""
+    """Returns G (p, m) and g (p,), with which the outputs rest at G u + g + d for constant inputs u."""
     per_u, rest = law.state_at_rest(model)
     return model.C @ per_u + model.D, model.C @ rest
 
 
 def feeds(law: Law) -> dict[str, np.ndarray]:
-    """feed = feed_u u + feed_y y* + feed_r r + feed_0 of `law.aim` for constant references."""
+    """Returns the terms of feed = feed_u u + feed_y y* + feed_r r + feed_0 in `law.aim`, for constant
+    references."""
     m, p = law.D.shape
     bare, none = law._replace(c=np.zeros(len(law.c))), np.zeros(p)
 
@@ -321,7 +325,7 @@ def _governing(exported: Exported) -> str:
 
 
 def _no_members(at: dict[str, int]) -> dict[str, np.ndarray]:
-    """The tables of `member_halves` where nothing is governed."""
+    """Returns the tables of `member_halves`, all zero, if there is no governor."""
     f, n, p, m = (at[name] for name in ("members", "watched", "outputs", "inputs"))
     h = p * at["instants"]
     shapes = {
@@ -334,8 +338,9 @@ def _no_members(at: dict[str, int]) -> dict[str, np.ndarray]:
 
 
 def member_halves(family: Governor) -> dict[str, np.ndarray]:
-    """The matrices of a Governor without what is known to be zero or said twice: state and what it lacks at
-    the weakest move alike, so that each block stands once. Golden vectors tell if it has another form."""
+    """Returns the matrices of a Governor without known zeros and duplicates. The state and what it lacks at
+    the weakest move in the same way, so each block is stored once. The golden vectors fail if a governor has
+    another form."""
     f, p = family.offset.shape
     n = family.start_0.shape[1] // 2
     C, A = (part.transpose(0, 2, 1)[:, : len(part[0].T) // 2, :n] for part in (family.see, family.move))
@@ -355,12 +360,12 @@ def member_halves(family: Governor) -> dict[str, np.ndarray]:
 
 
 def _least(rows: np.ndarray) -> np.ndarray:
-    """Effects (f, p h) from which on an input counts, as law._swept has them, of rows (f, m, p h)."""
+    """Returns the smallest effects (f, p h) that count, as in law._swept, for rows (f, m, p h)."""
     return law.LEAST_EFFECT * np.maximum(rows, 0.0).max(axis=1)
 
 
 def _law(name: str, deployed: Deployed) -> str:
-    """`static const law <name>` with its matrices."""
+    """Returns `static const law <name>` with its matrices."""
     law, limits = deployed.law, deployed.limits
     q, (_, p) = len(law.A), law.D.shape
     A = np.zeros(0) if deployed.shift else law.A
@@ -413,7 +418,7 @@ OF_OBSERVER = (
 
 
 def supervising(s: supervise.Supervision) -> str:
-    """Supervision with the constants that its step takes from its module."""
+    """Returns the Supervision, with the constants that its step takes from its module."""
     arrays = {name: getattr(s, name) for name in OF_OBSERVER}
     arrays |= {"coldest": s.coldest, "hottest": s.hottest, "noise": s.noise_degC}
     return "".join(
@@ -439,5 +444,5 @@ def integers(name: str, values: np.ndarray) -> str:
 
 
 def identifier(name: str) -> str:
-    """`name` in capitals, with _ for what no identifier may hold."""
+    """Returns `name` in capitals, with _ for characters that no identifier may contain."""
     return re.sub(r"\W", "_", name, flags=re.ASCII).upper()

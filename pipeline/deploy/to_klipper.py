@@ -1,7 +1,5 @@
-"""Settings for printers that run Klipper or Kalico, and the module by which the controller runs a heater.
-
-The owner's own PID, limits and max_temp stay as they are.
-"""
+"""Settings for printers that run Klipper or Kalico, and the module with which the controller runs a heater.
+The owner's own PID, limits and max_temp are not changed."""
 
 from pathlib import Path
 
@@ -16,10 +14,11 @@ SECTIONS = ("extruder", "heater_bed")
 
 
 def settings(exported: Exported, certificate: Certificate, *, section: str) -> str:
-    """The text of FILE, which printer.cfg includes: the section of the module.
+    """Returns the text of FILE, which printer.cfg includes: the section of the module.
 
-    Raises ValueError for a machine of more than one heater or sensor, for an unknown section, and where the
-    certificate was not passed, or is of another controller."""
+    Raises ValueError for a machine with more than one heater or sensor, for an unknown section, and if the
+    certificate was not passed, or belongs to another controller.
+    """
     check(exported)
     check_certificate(exported, certificate)
     one_heater(exported)
@@ -43,14 +42,15 @@ def settings(exported: Exported, certificate: Certificate, *, section: str) -> s
 
 
 def _disturbance_line(signal: Signal, section: str) -> str:
-    """What measures a disturbance, from its unit; an owner changes it to another fan or extruder, or none."""
+    """Returns the line with the source of a disturbance, chosen by its unit. An owner may change it to
+    another fan or extruder, or none."""
     sources = {PERCENT: "fan", "mm/s": section if section == "extruder" else "none"}
     return f"disturbance_{signal.name}: {sources.get(signal.unit, 'none')}  # in {signal.unit}"
 
 
 def module(exported: Exported, certificate: Certificate) -> dict[str, str]:
-    """The two files for klippy/extras/ by which the controller itself runs the heater. Raises ValueError as
-    `settings` does."""
+    """Returns the two files for klippy/extras/ with which the controller itself runs the heater. Raises
+    ValueError as `settings` does."""
     one_heater(exported)
     return {
         MODULE.stem: MODULE.read_text(encoding="utf-8"),

@@ -1,8 +1,8 @@
-"""A controller as one Python file that needs numpy only.
+"""Exports a controller as one Python file that needs numpy only.
 
-The file holds the two modules that the stages run, to the letter: controllers/law.py and supervise.py. After
-them stand the text of controller.json, the arrays, and `controller(...)`, which gives the object. It refuses
-another plant, unit or sample time; a simulated one runs only as a rehearsal.
+The file holds verbatim the two modules that the stages run: controllers/law.py and supervise.py. After them
+come the text of controller.json, the arrays, and `controller(...)`, which returns the object. It refuses
+another plant, unit or sample time. A controller made for a simulated plant runs only with rehearsal=True.
 """
 
 import base64
@@ -20,14 +20,15 @@ LINE = 100
 
 
 def text(exported: Exported, certificate: Certificate) -> str:
-    """The file. Raises ValueError if the certificate was not passed, or is of another controller."""
+    """Returns the file. Raises ValueError if the certificate was not passed, or belongs to another
+    controller."""
     check(exported)
     check_certificate(exported, certificate)
     return code(exported, sha256(certificate))
 
 
 def code(exported: Exported, certificate_sha256: str) -> str:
-    """The file, whatever its certificate says."""
+    """Returns the file, whatever its certificate says."""
     machine, (about, arrays) = exported.machine, parts(exported)
     coded = base64.b64encode(packed(arrays)).decode()
     values = {
@@ -51,5 +52,5 @@ def code(exported: Exported, certificate_sha256: str) -> str:
 
 
 def exported_part(module: object) -> str:
-    """The text of a module after MARK."""
+    """Returns the text of a module after MARK."""
     return Path(str(vars(module)["__file__"])).read_text(encoding="utf-8").partition(MARK)[2]

@@ -1,4 +1,4 @@
-"""The setpoint loop's eyes and what decides there for a machine without jax: classifier.safetensors with
+"""Exports the setpoint loop's classifier and filter for a machine without jax: classifier.safetensors with
 flow_reader.py, and filter.safetensors with flow_filter.py. The readers need numpy only."""
 
 import importlib.util
@@ -30,12 +30,12 @@ Weights = dict[str, dict[str, np.ndarray]]  # arrays by name, of each file of FI
 
 
 def weights(model: CalibratedClassifier, decides: FlowFilter) -> Weights:
-    """Arrays of the classifier and of the filter."""
+    """Returns the arrays of the classifier and of the filter."""
     return dict(zip(FILES, (classifier_arrays(model), filter_arrays(decides)), strict=True))
 
 
 def write(folder: str | Path, made: Weights) -> None:
-    """Each file of weights, and its reader beside it."""
+    """Writes each file of weights, and its reader beside it."""
     for name, arrays in made.items():
         schema, reader = FILES[name]
         source = Path(str(reader.__file__))
@@ -44,7 +44,7 @@ def write(folder: str | Path, made: Weights) -> None:
 
 
 def classifier_arrays(model: CalibratedClassifier) -> dict[str, np.ndarray]:
-    """Weights, form and calibration."""
+    """Returns weights, structure and calibration."""
     body, fitted = model.network.body, model.calibration
     return named_arrays(model.network) | {
         "patch": np.array(body.patch),
@@ -63,7 +63,7 @@ def classifier_arrays(model: CalibratedClassifier) -> dict[str, np.ndarray]:
 
 
 def filter_arrays(decides: FlowFilter) -> dict[str, np.ndarray]:
-    """The filter's numbers, and the grid, borders and moves that they are of."""
+    """Returns the filter's values, with their grid, borders and moves."""
     return {name: np.asarray(value, float) for name, value in decides._asdict().items()} | {
         "grid": flow_filter.GRID,
         "outliers": np.array(flow_filter.OUTLIERS),
@@ -84,8 +84,9 @@ WHY = (
 def write_checked(
     folder: Path, name: str, model: CalibratedClassifier, decides: Any, seed: int
 ) -> dict[str, Any]:
-    """Writes the files of a default controller of this name and parameters, none if the classifier cannot
-    judge its camera. Returns why there is no certificate, and how far the reader is from the network."""
+    """Writes the files of a default controller with this name and parameters; writes none if it is not a flow
+    filter, or if the classifier cannot judge its camera. Returns why there is no certificate, and how far the
+    reader differs from the network."""
     why = "" if isinstance(decides, FlowFilter) else f"{name} has no filter whose tables could be exported."
     if not may_judge(model.calibration.proof):
         why = f"The classifier {verdict(model.calibration.proof)}."
@@ -97,7 +98,7 @@ def write_checked(
 
 
 def of_reader(folder: Path, model: CalibratedClassifier, rng: np.random.Generator) -> float:
-    """The largest difference in log(flow / 100 %) between the exported reader and the network."""
+    """Returns the largest difference in log(flow / 100 %) between the exported reader and the network."""
     reader = _module(folder / "flow_reader.py")
     weights = reader.read_safetensors(folder / "classifier.safetensors")
     images = rng.integers(0, 256, (FRAMES, 16, 48)).astype(np.float32)

@@ -1,8 +1,10 @@
-"""Golden vectors: what the object does on its own model, with noise, changed references, faults, hand-overs.
+"""Golden vectors: what the Python object does on its own model, with noise, changed references, faults and
+hand-overs.
 
 A script says what happens to machine and controller at each sample. `played` runs it with any object that has
-the calls of supervise.Supervised; the C test runs the same script with the exported code. Both close the
-loop themselves: outputs fed to a law that is unstable by itself would tell rounding errors apart, no more.
+the methods of supervise.Supervised; the C test runs the same script with the exported code. Both close the
+loop themselves. If recorded outputs were fed to a law that is unstable by itself, only rounding errors would
+be compared.
 
     x(t+1) = A x + B (share u + extra) + b,   y = C x + d + add, or what `reading` says
 """
@@ -18,18 +20,19 @@ from pipeline.temperature.plant import hold_output, strictly_proper
 
 # what is done at a sample: in manual; a step; before it hand over, restore, or acknowledge; begin anew
 WATCH, STEP, HAND_OVER, RESTORE, ACKNOWLEDGE, BEGIN = range(6)
-# readings that are none of the plant's: no number at all, and the one before once more
+# readings that do not come from the plant: no number, and the previous reading once more
 LOST, REPEATED = np.inf, -np.inf
 TOLERANCE = 1e-9  # of each input's range
-# largest share of an input's range by which readings moved by UNSURE may move an input: a law's own gains
+# largest change of an input, as a fraction of its range, if readings change by UNSURE: from a law's own gains
 OWN_GAINS = 1e-6
-UNSURE = 1e-9  # degC: what no reading is known to, and more than rounding of any forecast
+UNSURE = 1e-9  # degC: smaller than the accuracy of any reading, larger than the rounding of any forecast
 
 
 class Script(NamedTuple):
-    """By sample (T,): do, t_s, told (1: the controller reads back what was applied); r, add, reading (T, p)
-    in degC, reading NaN where it is the plant's; manual, share, extra (T, m); disturbances (T, q) that it is
-    told, NaN for one that is not known. They take from the inputs what is fed forward."""
+    """For each sample (T,): `do`, `t_s`, `told` (1: the controller reads back what was applied); `r`, `add`,
+    `reading` (T, p) in degC, reading NaN for the plant's own; `manual`, `share`, `extra` (T, m);
+    `disturbances` (T, q) that the controller gets, NaN if unknown. They reduce the inputs by what is fed
+    forward for them."""
 
     do: np.ndarray
     t_s: np.ndarray
@@ -44,7 +47,8 @@ class Script(NamedTuple):
 
 
 class Played(NamedTuple):
-    """By sample: inputs u (T, m) asked for, mode (T,) and causes (T,), a bit for each of KINDS."""
+    """For each sample: requested inputs `u` (T, m), `mode` (T,) and `causes` (T,), one bit for each of
+    KINDS."""
 
     u: np.ndarray
     mode: np.ndarray
@@ -52,7 +56,7 @@ class Played(NamedTuple):
 
 
 class EpisodeStart(NamedTuple):
-    """Where an episode begins: the model's state x (n,), the inputs u (m,) that hold it, outputs y (p,)."""
+    """Start of an episode: the model's state x (n,), the inputs u (m,) that hold it, and outputs y (p,)."""
 
     x: np.ndarray
     u: np.ndarray
@@ -60,8 +64,8 @@ class EpisodeStart(NamedTuple):
 
 
 def start(exported: Exported) -> EpisodeStart:
-    """The model at rest in the middle of its outputs' limits; where none is declared, at a third of the
-    inputs' range."""
+    """Returns the model at rest in the middle of its outputs' limits; if these are not declared, at a third
+    of the inputs' range."""
     model, machine = strictly_proper(exported.model), exported.machine
     low, high = (np.array([getattr(one, side) for one in machine.inputs]) for side in ("low", "high"))
     bottom, top = (np.array([getattr(one, side) for one in machine.outputs]) for side in ("low", "high"))
@@ -74,12 +78,12 @@ def start(exported: Exported) -> EpisodeStart:
 
 
 def script(exported: Exported, *, episodes: int, steps: int, rng: np.random.Generator) -> Script:
-    """Several episodes, one after the other."""
+    """Returns several episodes, one after the other."""
     return joined([episode(exported, steps, rng) for _ in range(episodes)])
 
 
 def joined(parts: Sequence[Any]) -> Any:
-    """Scripts, or what was played, one after the other."""
+    """Concatenates scripts, or results of scripts."""
     return type(parts[0])(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
@@ -87,8 +91,8 @@ MANUAL = 25
 
 
 def episode(exported: Exported, steps: int, rng: np.random.Generator) -> Script:
-    """`steps` samples: MANUAL in manual, then the law with references that change, and in most episodes one
-    fault for a while."""
+    """Returns `steps` samples: MANUAL in manual, then the law with changing references, and in most episodes
+    one fault for a while."""
     machine, at = exported.machine, start(exported)
     (m, p), T = (len(machine.inputs), len(machine.outputs)), machine.sample_time_s
     low, high = (np.array([getattr(one, side) for one in machine.inputs]) for side in ("low", "high"))
@@ -124,8 +128,8 @@ def episode(exported: Exported, steps: int, rng: np.random.Generator) -> Script:
 
 
 def _reach(exported: Exported) -> np.ndarray:
-    """How far (p,) in degC references may lie from the start: a little beyond the outputs' limits, so that
-    the governor acts and some are out of reach."""
+    """Returns how far (p,) in degC references may lie from the start: a little beyond the outputs' limits, so
+    that the governor acts and some are out of reach."""
     bottom, top = (
         np.array([getattr(one, side) for one in exported.machine.outputs]) for side in ("low", "high")
     )
@@ -134,8 +138,8 @@ def _reach(exported: Exported) -> np.ndarray:
 
 
 def _told(exported: Exported, steps: int, rng: np.random.Generator) -> np.ndarray:
-    """Disturbances (T, q) in steps, each of which feeds a twentieth of an input's range forward at most; one
-    in ten samples of the second half is not known."""
+    """Returns disturbances (T, q) in steps, each of which feeds forward at most a twentieth of an input's
+    range. One in ten samples of the second half is unknown."""
     forward = exported.controller.forward
     if forward is None:
         return np.zeros((steps, len(exported.machine.disturbances)))
@@ -151,7 +155,7 @@ FAULTS = ("none", "lost", "frozen", "frozen", "cold", "on", "on", "off", "off", 
 
 
 def fault(made: Script, kind: str, when: slice, exported: Exported, rng: np.random.Generator) -> None:
-    """Puts a fault of one signal into a script."""
+    """Inserts a fault of one signal into a script."""
     m, p = made.manual.shape[1], made.r.shape[1]
     i, j = int(rng.integers(m)), int(rng.integers(p))
     high, T = exported.machine.inputs[i].high, exported.machine.sample_time_s
@@ -174,7 +178,7 @@ def fault(made: Script, kind: str, when: slice, exported: Exported, rng: np.rand
 
 
 def played(make: Any, exported: Exported, at: EpisodeStart, script: Script) -> Played:
-    """The script run on the model of a controller, with the object that `make()` gives."""
+    """Runs the script on the model of a controller, with the object that `make()` returns."""
     plant = strictly_proper(exported.model)
     forward = fed_forward(exported.controller, script.disturbances)
     T, m = script.manual.shape
@@ -210,7 +214,7 @@ def _read(measured: np.ndarray, reading: np.ndarray, before: np.ndarray) -> np.n
 
 
 def _before(one: Any, make: Any, do: int, y: np.ndarray) -> Any:
-    """What is done before the step."""
+    """Does what must happen before the step: hand over, acknowledge or restore. Returns the object."""
     if do == HAND_OVER:
         one.hand_over(y)
     elif do == ACKNOWLEDGE:
@@ -222,7 +226,8 @@ def _before(one: Any, make: Any, do: int, y: np.ndarray) -> Any:
 
 
 def as_csv(at: EpisodeStart, script: Script, done: Played) -> str:
-    """golden.csv: the start in its first line, then a line a sample, numbers as they read back bit by bit."""
+    """Returns golden.csv: the start in its first line, then one line for each sample, with numbers that read
+    back exactly."""
     lines = [",".join(map(repr, np.r_[at.x, at.u, at.y].tolist()))]
     columns = [script.do, script.told, done.mode, done.causes]
     for t in range(len(script.do)):
@@ -235,13 +240,13 @@ def as_csv(at: EpisodeStart, script: Script, done: Played) -> str:
 
 
 def play_often(exported: Exported, make: Any, script: Script, *, replays: int = 3) -> tuple[Played, float]:
-    """An episode, and by how much, as a share of an input's range, the object asks for something else when
-    its readings move by UNSURE up or down, in `replays` episodes more; infinite if a mode or a cause differs.
-    Ends with the first difference above OWN_GAINS.
+    """Plays an episode, and `replays` more with readings moved by UNSURE up or down. Returns the first, and
+    the largest change of the requested inputs as a fraction of an input's range; infinite if a mode or a
+    cause differs. Stops at the first change above OWN_GAINS.
 
-    If a law swings between its governor and its limits, the loop itself may magnify rounding, twofold a
-    sample. Then the object disagrees with itself, and nobody can agree with it: not on another CPU, and not
-    in C.
+    If a law switches between its governor and its limits, the loop itself may amplify rounding, twofold in
+    each sample. Then the object does not agree with itself, so neither another CPU nor C code can agree with
+    it.
     """
     at, rng = start(exported), np.random.default_rng(0)
     span = np.array([signal.high - signal.low for signal in exported.machine.inputs])
@@ -259,8 +264,8 @@ def play_often(exported: Exported, make: Any, script: Script, *, replays: int = 
 def golden(
     exported: Exported, *, episodes: int = 5, steps: int = 120, seed: int = 1, replays: int = 3
 ) -> str:
-    """golden.csv of a controller: what its object does in `episodes` that do not magnify rounding, as
-    `replays` of each show."""
+    """Returns golden.csv of a controller: the object's results in `episodes` episodes that do not amplify
+    rounding, tested by `replays` of each. Raises ValueError if too few such episodes are found."""
     rng, scripts, done = np.random.default_rng(seed), [], []
     for _ in range(10 * episodes):
         asked = episode(exported, steps, rng)

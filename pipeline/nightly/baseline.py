@@ -1,8 +1,8 @@
-"""What the champion's own recordings say of its model: the yardstick of every later night.
+"""The results of the champion's own recordings with its model: the reference for every later night.
 
-A model is never right to the last digit. What it gets wrong on every record is taken up here, so that a new
-one is held against records that are known to be good: the errors' size, how honest nights scatter in the air
-around and in the level of each output, and what each cause seems to be on them.
+A model is never exact. Its errors that appear on every record are included here, so that a new record is
+compared with records that are known to be good: the errors' size, how honest nights scatter in the ambient
+air and in the level of each output, and the estimate of each cause on them.
 """
 
 from collections.abc import Sequence
@@ -14,8 +14,8 @@ import scipy.stats
 from pipeline.nightly import drift
 from pipeline.nightly.drift import Changes, DriftCause, DriftRecord, ProductionModel, Scatter, Segments
 
-OWN = 0.05  # share of its errors that a cause must explain of the champion's own records, to be taken up
-VERSION, BEFORE = 3, 2  # of reference.json; that before it is read too
+OWN = 0.05  # fraction of the errors on the champion's own records that a cause must explain to be included
+VERSION, BEFORE = 3, 2  # of reference.json; the previous version is read too
 # the changes of a machine as version 2 named them, each a list by channel
 KINDS_BEFORE = {
     "gain": "gain", "rate": "time constant", "delay": "delay", "cap": "saturation", "offset": "offset",
@@ -24,19 +24,19 @@ KINDS_BEFORE = {
 
 
 class Floors(NamedTuple):
-    """°C below which no scatter of honest nights is believed, since they are few: of an output's level and of
-    the air around."""
+    """Least standard deviations of honest nights in °C, since these nights are few: of an output's level, and
+    of the ambient air."""
 
     level: float
     ambient: float
 
 
 class Baseline(NamedTuple):
-    """Of the champion's own recordings: the scale, what of the model they already hold to be otherwise, and
-    by cause the estimates of each night (nights, causes), their deviations and what they explain, by the
-    models without that night and again by the champion's own. Then the
-    logarithm of the variance of the noise (nights, p), its deviation, and the weighted error a sample
-    (nights,)."""
+    """Results of the champion's own recordings: `scale`; `changes` that they already show against the model;
+    and for each cause the estimates of each night (nights, causes), their standard deviations and what they
+    explain, first with the models without that night and again with the champion's own model. Then the
+    logarithm of the noise variance (nights, p), its standard deviation, and the weighted squared error per
+    sample (nights,)."""
 
     scale: Scatter
     changes: Changes
@@ -48,11 +48,11 @@ class Baseline(NamedTuple):
     misfit: np.ndarray
 
     def usual(self, causes: Sequence[DriftCause]) -> dict[DriftCause, float]:
-        """What each cause explains of an honest record at most."""
+        """Returns the most that each cause explains of an honest record."""
         return dict(zip(causes, self.explained.max(axis=0).tolist(), strict=True))
 
     def to_json(self) -> dict[str, Any]:
-        """As reference.json has it."""
+        """Returns the baseline as in reference.json."""
         arrays = {name: np.asarray(getattr(self, name)).tolist() for name in self._fields[2:]}
         changes = [[*cause, value] for cause, value in self.changes]
         return {"scale": [np.asarray(one).tolist() for one in self.scale], "changes": changes, **arrays}
@@ -65,7 +65,7 @@ class Baseline(NamedTuple):
 
 
 def rewrite(fields: dict[str, Any]) -> dict[str, Any]:
-    """A baseline of version 2 as version 3 has it; an input without a cap had one of 1e9."""
+    """Converts a baseline of version 2 to version 3. In version 2 an input without a cap had one of 1e9."""
     changes = [
         (KINDS_BEFORE[name], channel, value)
         for name, values in fields["changes"].items()
@@ -81,8 +81,8 @@ def measured(
     floors: Floors,
     without: Sequence[ProductionModel] | None = None,
 ) -> Baseline:
-    """The baseline of a champion's nights, each held against the model of `without` that was identified
-    without it (None: the champion's own). Raises ValueError where they are too short."""
+    """Returns the baseline of a champion's nights. Each is compared with the model of `without` that was
+    identified without it (None: with the champion's own). Raises ValueError if the nights are too short."""
     together = [pair for night in nights for pair in night]
     loose = _loose(machine, together)
     record = drift.record(machine, together, loose)
@@ -92,8 +92,8 @@ def measured(
     models = without or [machine] * len(nights)
     scale = _scale(models, nights, loose, changes, floors)
     records = [rested(model, night, scale, changes) for model, night in zip(models, nights, strict=True)]
-    # a new night is held against the champion's own model: what that one gets wrong of its own nights, and
-    # those without them do not, is no change of the machine either
+    # a new night is compared with the champion's own model, so its errors on its own nights, which the models
+    # without them do not have, are no change of the machine either
     held = [*records, *(rested(machine, night, scale, changes) for night in (nights if without else []))]
     estimates = np.array([[fit[1:] for fit in drift.alone(one, changes)] for one in held])
     noises = [noise(drift.by_output(one, drift.left(one, changes))) for one in records]
@@ -104,20 +104,20 @@ def measured(
 
 
 def rested(machine: ProductionModel, segments: Segments, scale: Scatter, changes: Changes) -> DriftRecord:
-    """A record in the surroundings that it was made in."""
+    """Returns a record prepared with the surroundings in which it was made."""
     there, room = drift.room_of(machine, segments, scale, changes)
     return drift.record(machine, segments, there, room._replace(another_season=False))
 
 
 def misfit(record: DriftRecord, changes: Changes) -> float:
-    """Weighted squared error a sample: near 1 on a record like the champion's own."""
+    """Returns the weighted squared error per sample: near 1 on a record like the champion's own."""
     e = drift.left(record, changes)
     return float(e @ e) / max(sum(int(one.measured.sum()) for one in record.segments), 1)
 
 
 def noise(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Logarithm of the variance (p,) of errors (T, p) from one sample to the next, which nothing slow enters,
-    and its standard deviation from their blocks."""
+    """Returns the logarithm of the variance (p,) of errors (T, p) from one sample to the next, which slow
+    changes do not affect, and its standard deviation from blocks."""
     steps = np.diff(errors, axis=0) ** 2 / 2
     whole = np.maximum(np.nanmean(steps, axis=0), 1e-12)
     parts = np.stack(
@@ -127,7 +127,7 @@ def noise(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _loose(machine: ProductionModel, together: Segments) -> Scatter:
-    """The scale before any night is known: errors as large as they are."""
+    """Returns the scale before any night is known, with the variance of the errors as they are."""
     plant = machine.plant
     scale = Scatter(np.ones(plant.p), 30.0, np.full(plant.p, 5.0), np.zeros(plant.p))
     for _ in range(2):
@@ -144,8 +144,8 @@ def _scale(
     changes: Changes,
     floors: Floors,
 ) -> Scatter:
-    """How honest nights scatter, from these. Of a few nights a standard deviation is small by chance:
-    Student's quantile for it, and the new night's own share."""
+    """Estimates the scatter of honest nights. With few nights a standard deviation may be too small by
+    chance, so it is enlarged by Student's quantile and by the new night's own share."""
     records = [rested(model, night, loose, changes) for model, night in zip(models, nights, strict=True)]
     airs, own = zip(*(drift.levels(record, changes) for record in records), strict=True)
     count = len(nights)

@@ -1,4 +1,4 @@
-"""What a person changes in production: back to an earlier champion, or a drift that is meant to stay."""
+"""Manual changes of production: back to an earlier champion, or accepting a drift as the new normal."""
 
 import contextlib
 import datetime
@@ -13,8 +13,8 @@ from pipeline.store import artifacts, params
 
 
 def rollback(run: str, loop: str, *, dry_run: bool = False) -> str:
-    """Puts the champion of an earlier run back into production, bit by bit, and says what was done. With
-    `dry_run` it says what would be done, and changes nothing."""
+    """Puts the identical champion of an earlier run back into production, and returns what was done. With
+    `dry_run`, returns what would be done and changes nothing."""
     params.load(Nightly, "nightly")
     if dry_run:
         earlier = champion.find_earlier(champion.read(), run, loop)
@@ -37,8 +37,9 @@ def rollback(run: str, loop: str, *, dry_run: bool = False) -> str:
 
 
 def accept(loop: str, why: str) -> str:
-    """Measures the champion's reference anew from the recordings since the drift, and commits it with the
-    reason; the champion itself stays. Raises ValueError if the loop has no alarm."""
+    """Makes a new reference for the champion from the recordings since the drift, and commits it with the
+    reason; the champion itself is kept. Raises ValueError if the loop has no alarm, or if these recordings
+    are too short or gone."""
     settings = params.load(Nightly, "nightly")
     with _alone() as state:
         memory = remembered.read()
@@ -71,7 +72,7 @@ def accept(loop: str, why: str) -> str:
 
 @contextlib.contextmanager
 def _alone() -> Generator[ChampionState]:
-    """The lock, with what a killed night left put right, and what is in production."""
+    """Holds the lock, repairs what a killed run left, and gives the state of production."""
     with worktree.locked():
         landing.get_branch()
         worktree.clear_killed()
@@ -84,7 +85,7 @@ def _alone() -> Generator[ChampionState]:
 
 
 def _change(state: ChampionState, change: Callable[[ChampionState], ChampionState], message: str) -> str:
-    """Changes production in a copy, and lands; the commit."""
+    """Changes production in a copy, puts the change into the project, and returns the commit."""
     snapshot = worktree.take()
     worktree.make_bare(Snapshot(snapshot.head, snapshot.head))
     with contextlib.chdir(COPY):

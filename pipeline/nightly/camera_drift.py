@@ -1,5 +1,5 @@
-"""Has the camera moved, the light or the ink changed, the focus gone? Figures of a line's frames, held
-against those of nights that are known to be good; and of a nozzle's camera the balance of classes."""
+"""Has the camera moved, has the light or the ink changed, is it out of focus? Compares figures of a line's
+frames with those of nights that are known to be good; for a nozzle camera, the balance of classes."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,9 +9,9 @@ import numpy as np
 from pipeline.nightly.drift import Shift, shift
 
 FIGURES = ("row_px", "tilt_px", "background", "contrast", "sharpness_per_px", "width_px")
-VISIBLE = 12.0  # gray levels by which a bead must stand out of its background to be looked at
-# background and contrast that change by shares within this ratio of each other changed together: the light,
-# not the ink
+VISIBLE = 12.0  # gray levels by which a bead must stand out of its background to be measured
+# if the relative changes of background and contrast are within this ratio of each other, the light has
+# changed, not the ink
 ALIKE = 0.5
 
 
@@ -19,12 +19,11 @@ Stats = tuple[np.ndarray, np.ndarray]  # median and its standard deviation of a 
 
 
 def figures(frames: Sequence[np.ndarray]) -> Stats:
-    """Of grey frames (h, w) with a line along the columns, median (6,) of FIGURES and its standard deviation
-    (6,): row of its middle, how much lower it lies at the right end than at the left, background level,
-    contrast of the bead (below 0: dark on light), steepest edge as a share of the contrast per px, width at
-    half contrast in px. A figure counts a frame as new only every fifth: beads are long. Raises ValueError if
-    fewer than five frames show a bead.
-    """
+    """Returns the median (6,) of FIGURES over grey frames (h, w) with a line along the columns, and its
+    standard deviation (6,). The figures are: row of the line's middle; how much lower it lies at the right
+    end than at the left; background level; contrast of the bead (below 0: dark on light); steepest edge as a
+    fraction of the contrast per px; width at half contrast in px. Only every fifth frame counts as
+    independent, because beads are long. Raises ValueError if fewer than five frames show a bead."""
     rows = np.array([row for frame in frames if (row := _frame(np.asarray(frame, float))) is not None])
     if len(rows) < 5:
         raise ValueError(
@@ -70,7 +69,7 @@ def _middle(away: np.ndarray, contrast: float) -> float:
 
 
 class CameraChange(NamedTuple):
-    """What has changed, in words, its key for the night after, and by how many sigmas."""
+    """A change in words, its key for the next run, and its size in sigmas."""
 
     key: str
     words: str
@@ -78,7 +77,7 @@ class CameraChange(NamedTuple):
 
 
 def shift_of(now: Stats, before: Sequence[Stats]) -> Shift:
-    """Figures of a night against those of the nights before."""
+    """Compares the figures of a night with those of the nights before."""
     usual, deviations = (np.stack(each) for each in zip(*before, strict=True))
     return shift(*now, usual, deviations)
 
@@ -86,8 +85,9 @@ def shift_of(now: Stats, before: Sequence[Stats]) -> Shift:
 def changes(
     now: Stats, before: Sequence[Stats], *, moved_px: float, contrast_percent: float
 ) -> tuple[Shift, list[CameraChange]]:
-    """What the camera's figures say, the cause named: moved, other light, other ink, out of focus. The bead's
-    width is the process's own affair. Changes that do not matter are left out, however sure."""
+    """Returns the shift of the camera's figures, and the causes: moved, other light, other ink, or out of
+    focus. The bead's width is left out, because it depends on the process. So are changes too small to
+    matter, however certain."""
     moved = shift_of(now, before)
     by = moved.value - moved.reference
     percent = 100 * np.divide(by, abs(moved.reference), out=np.zeros_like(by), where=moved.reference != 0)
@@ -109,7 +109,8 @@ def changes(
 
 
 def _light_or_ink(background: float, contrast: float, limit: float) -> tuple[str, str] | None:
-    """Background and contrast that change alike, in percent: the light. Contrast alone: the ink."""
+    """Returns the cause of changes in percent. If background and contrast change alike, it is the light; if
+    the contrast changes alone, it is the ink."""
     light, ink = abs(background) >= limit, abs(contrast) >= limit
     alike = min(abs(background), abs(contrast)) >= ALIKE * max(abs(background), abs(contrast))
     if (light or ink) and alike and background * contrast > 0:
@@ -132,15 +133,17 @@ KINDS = ("are under-extruded", "are well extruded", "are over-extruded", "show n
 
 
 def line_contrast(scores: np.ndarray, *, together: float) -> Stats:
-    """Median contrast (1,) of the line in gray levels, of the frames' ridge scores, and its standard
-    deviation (1,); frames come in segments of `together` that look alike, and a segment counts once."""
+    """Returns the median contrast (1,) of the line in gray levels, from the frames' ridge scores, and its
+    standard deviation (1,). Frames come in segments of `together` similar frames, and each segment counts
+    once."""
     middle = float(np.median(scores))
     spread = 1.4826 * 1.2533 * float(np.median(np.abs(scores - middle)))
     return np.array([middle]), np.array([max(spread * np.sqrt(together / len(scores)), 1e-6)])
 
 
 def contrast_changes(now: Stats, before: Sequence[Stats], *, percent: float) -> list[CameraChange]:
-    """The line stands out less, or more, than in the prints before, by at least `percent`."""
+    """Returns a change if the line's contrast differs from that of the prints before by at least
+    `percent`."""
     moved = shift_of(now, before)
     by = 100 * float(moved.value[0] / max(moved.reference[0], 1e-9) - 1)
     words = (
@@ -153,8 +156,8 @@ def contrast_changes(now: Stats, before: Sequence[Stats], *, percent: float) -> 
 def balance_changes(
     now: np.ndarray, before: np.ndarray, *, together: float, points: float
 ) -> list[CameraChange]:
-    """Of counts (4,) of KINDS against those of the prints before (prints, 4): the kind that has moved most
-    surely by at least `points`; frames without a line go before classes."""
+    """Compares counts (4,) of KINDS with those of the prints before (prints, 4). Returns the kind that
+    changed most certainly, if by at least `points`; frames without a line come before classes."""
     balance = class_balance(now, before, together=together)
     by = balance.value - balance.reference
     moved = [k for k in range(len(KINDS)) if abs(by[k]) >= points]
@@ -176,9 +179,10 @@ def balance_changes(
 def foreign_changes(
     now: np.ndarray, before: np.ndarray, *, together: float, points: float
 ) -> list[CameraChange]:
-    """Of counts (2,) of frames that look like what the classifier learned from, and of those that do not,
-    against the prints before (prints, 2): more of these by at least `points`. No label is asked. How sure
-    the classifier is of its classes says nothing: of frames out of focus it is surer, and wrong."""
+    """Compares counts (2,) of frames that look like what the classifier learned from, and of frames that do
+    not, with the prints before (prints, 2). Returns a change if the share of the latter grew by at least
+    `points`. No labels are needed. The classifier's own confidence is no help: on frames out of focus it is
+    more confident, and wrong."""
     share = class_balance(now, before, together=together)
     if share.value[1] - share.reference[1] < points:
         return []
@@ -190,13 +194,13 @@ def foreign_changes(
 
 
 def class_balance(now: np.ndarray, before: np.ndarray, *, together: float) -> Shift:
-    """Shares of classes in counts now (classes,) against those of good nights (nights, classes), in points;
-    frames come in runs of `together` that say the same."""
+    """Compares shares of classes in the counts now (classes,) with those of good nights (nights, classes), in
+    percentage points. Frames come in runs of `together` equal frames."""
     shares = 100 * now / max(now.sum(), 1)
     usual = 100 * before / np.maximum(before.sum(axis=1, keepdims=True), 1)
 
     def deviation(percent: np.ndarray, count: np.ndarray) -> np.ndarray:
-        # half a run added to each class, so that a class that was never seen is not certain
+        # half a run is added to each class, so that a class that was never seen has no zero deviation
         p = (percent / 100 * count / together + 0.5) / (count / together + 0.5 * percent.shape[-1])
         return 100 * np.sqrt(p * (1 - p) / np.maximum(count / together, 1))
 

@@ -1,5 +1,5 @@
-"""Who is in production: champion.json and champion/<loop>.dvc in git, champion/<loop> beside them. What the
-last commit says is what counts; the folders follow it."""
+"""Manages production: champion.json and champion/<loop>.dvc in git, champion/<loop> beside them. The last
+commit decides, and the folders follow it."""
 
 import contextlib
 import ctypes
@@ -31,8 +31,8 @@ EXCHANGE, HERE = 2, -100  # RENAME_EXCHANGE and AT_FDCWD of renameat2
 
 
 def read(commit: str = "HEAD") -> ChampionState:
-    """champion.json of a commit, or one without champions if it has none. Raises ValueError if it is
-    broken."""
+    """Returns champion.json of a commit, or a state without champions if it has none. Raises ValueError if
+    the file is broken."""
     text = git("show", f"{commit}:{FILE}", check=False)
     try:
         fields = json.loads(text or "{}", object_hook=_drop_metrics)
@@ -45,12 +45,12 @@ def read(commit: str = "HEAD") -> ChampionState:
 
 
 def _drop_metrics(fields: dict[str, Any]) -> dict[str, Any]:
-    """Without the figures that champion.json had before."""
+    """Removes the metrics that older versions of champion.json contain."""
     return {key: value for key, value in fields.items() if key != "metrics"}
 
 
 def md5s(folder: Path) -> dict[str, str]:
-    """{path below the folder: MD5}, the hash that DVC's cache goes by."""
+    """Returns {path below the folder: MD5}, the hash that DVC's cache uses."""
     files = sorted(file for file in folder.rglob("*") if file.is_file())
     return {file.relative_to(folder).as_posix(): md5_of(file) for file in files}
 
@@ -61,7 +61,7 @@ def md5_of(path: Path | str) -> str:
 
 
 def same(md5_by_path: Mapping[str, str], files: Sequence[str]) -> bool:
-    """Whether a champion's files are these, byte for byte."""
+    """Returns whether a champion's files are identical to these."""
     return all(md5_by_path.get(name.removeprefix("datasets/")) == md5_of(name) for name in files)
 
 
@@ -75,8 +75,8 @@ def missing(files: Sequence[str]) -> list[str]:
 def hand_over(
     folder: str, files: Sequence[str], beside: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Copies the files into champion/<folder>, writes what is to lie beside them as JSON by name, and gives
-    the folder to DVC: what its pointer says, and MD5 by path."""
+    """Copies the files into champion/<folder>, writes the contents of `beside` there as JSON by name, and
+    adds the folder to DVC. Returns what its pointer says, and MD5 by path."""
     place = FOLDER / folder
     for name in files:
         target = place / name.removeprefix("datasets/")
@@ -88,21 +88,21 @@ def hand_over(
     dvc("add", "--quiet", str(place))
     pointer = yaml.safe_load((FOLDER / f"{folder}.dvc").read_text(encoding="utf-8"))["outs"][0]
     hashes = md5s(place)
-    # what `bring` takes them from is on the disk before a commit names it
+    # the cache files from which `bring` restores are on the disk before a commit names them
     for md5 in {pointer["md5"], *hashes.values()}:
         _write_through(Path(".dvc/cache/files/md5", md5[:2], md5[2:]))
     return pointer, hashes
 
 
 def remove(folder: str) -> None:
-    """champion/<folder> and its pointer go; DVC's cache keeps the files."""
+    """Removes champion/<folder> and its pointer; DVC's cache keeps the files."""
     (FOLDER / f"{folder}.dvc").unlink(missing_ok=True)
     shutil.rmtree(FOLDER / folder, ignore_errors=True)
 
 
 def bring(folder: str, champion: Champion) -> None:
-    """champion/<folder> as it was of `champion`, bit by bit: from DVC's cache, or pulled. Raises ValueError
-    if a file is not what it was."""
+    """Restores champion/<folder> exactly as it was for `champion`, from DVC's cache or by a pull. Raises
+    ValueError if a file differs."""
     path = FOLDER / f"{folder}.dvc"
     pointer = yaml.safe_dump({"outs": [dict(champion.folder)]}, sort_keys=False)
     artifacts.write_text(path, pointer)
@@ -122,7 +122,8 @@ def bring(folder: str, champion: Champion) -> None:
 
 
 def paths(state: ChampionState) -> list[str]:
-    """What a commit of the champions holds; a pointer that is gone is committed as gone."""
+    """Returns the paths that a commit of the champions contains. A deleted pointer is committed as
+    deleted."""
     before = {path for path in names("ls-files", "--", str(FOLDER)) if path.endswith(".dvc")}
     after = {f"{FOLDER}/{folder}.dvc" for folder in state.folders}
     return [str(FILE), f"{FOLDER}/.gitignore", *sorted(before | after)]
@@ -132,8 +133,8 @@ def paths(state: ChampionState) -> list[str]:
 
 
 def follow() -> list[str]:
-    """Brings champion/ to what champion.json of the last commit says, and says which loops it brought. A
-    folder takes the place of the one before it by one rename, when all its files are on the disk."""
+    """Brings champion/ to the state of champion.json in the last commit, and returns which loops it changed.
+    Each folder is replaced by a single rename, once all new files are on the disk."""
     state = read()
     stale = {name: one for name, one in state.folders.items() if md5s(FOLDER / name) != one.files}
     if stale and not COPY.exists():
@@ -158,7 +159,7 @@ def follow() -> list[str]:
 
 
 def exchange(new: Path, target: Path) -> None:
-    """`new` and `target` trade places: by one rename if the system can, else by two."""
+    """Exchanges `new` and `target`, by one rename if the system can, else by two."""
     rename = getattr(ctypes.CDLL(None), "renameat2", None)
     if target.exists() and rename and not rename(HERE, os.fsencode(new), HERE, os.fsencode(target), EXCHANGE):
         return
@@ -168,7 +169,7 @@ def exchange(new: Path, target: Path) -> None:
 
 
 def _write_through(path: Path) -> None:
-    """Waits until a file or a folder's entries are on the disk, which a rename alone does not ask for."""
+    """Waits until a file or a folder's entries are on the disk, which a rename alone does not guarantee."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -182,8 +183,8 @@ def _write_through(path: Path) -> None:
 def promote(
     state: ChampionState, loop: str, champion: Champion, *, event: str, when: str = "", why: str = ""
 ) -> ChampionState:
-    """The state with `champion` in production, and one more line of its history: `when` and `why` it went
-    there, which are the champion's own if they are empty."""
+    """Returns the state with `champion` in production, and one more line of history. `when` and `why`: of
+    this change; if they are empty, the champion's own are used."""
     before = state.champions.get(loop)
     replaced = before.files if before and event == ROLLED_BACK else {}
     line = HistoryLine(
@@ -194,7 +195,8 @@ def promote(
 
 
 def find_rolled_back(state: ChampionState, loop: str, files: Sequence[str]) -> str:
-    """The run whose champion these very files are, if somebody has rolled it back since; else empty."""
+    """Returns the run whose champion has exactly these files, if somebody has rolled it back since; else
+    ""."""
     run = ""
     for line in (line for line in state.history if line.loop == loop):
         if line.event == ROLLED_BACK and same(line.replaced, files):
@@ -205,16 +207,15 @@ def find_rolled_back(state: ChampionState, loop: str, files: Sequence[str]) -> s
 
 
 def stack(state: ChampionState, loop: str) -> list[tuple[int, Champion]]:
-    """Champions of a loop in the order in which they were promoted, the present one last, each with the
-    number of its line in the history. One that was rolled back is none of them any more, unless it was put
-    back."""
+    """Returns the champions of a loop in the order of promotion, the present one last, each with the number
+    of its line in the history. A champion that was rolled back is left out unless it was put back."""
     champions: list[tuple[int, Champion]] = []
     for number, line in enumerate(state.history):
         at = [k for k, (_, one) in enumerate(champions) if one.md5 == line.champion.md5]
         if line.loop != loop:
             continue
         if line.event == ROLLED_BACK and at:
-            champions = champions[: at[-1] + 1]  # down to the one that was put back
+            champions = champions[: at[-1] + 1]  # up to the one that was put back
         elif line.event == DRIFT_ACCEPTED:
             champions[-1] = (champions[-1][0], line.champion)
         else:
@@ -223,9 +224,9 @@ def stack(state: ChampionState, loop: str) -> list[tuple[int, Champion]]:
 
 
 def find_earlier(state: ChampionState, run: str, loop: str) -> dict[str, Champion]:
-    """{loop: champion} to go back to: those that were in production in `run`. If `run` is empty, the one
-    before the present one: of the loop whose present one was promoted last, unless `loop` is named. Raises
-    ValueError if there is none, or no such loop."""
+    """Returns {loop: champion} to go back to: those that were in production in `run`. If `run` is empty,
+    returns the previous champion of `loop`, or of the loop with the latest promotion if `loop` is empty.
+    Raises ValueError if there is none, or no such loop."""
     if loop and loop not in state.champions:
         loops = ", ".join(state.champions) or "none"
         raise ValueError(

@@ -1,4 +1,4 @@
-"""`./run beadline nightly`: a run, its watch, and what a person changes by hand."""
+"""`./run beadline nightly`: a run, its watch, and manual changes of production."""
 
 import argparse
 from typing import TYPE_CHECKING
@@ -8,7 +8,8 @@ if TYPE_CHECKING:
 
 
 def run(arguments: argparse.Namespace, render: "Render") -> tuple[int, str]:
-    """Exit status for a scheduler, and one line for a person; `render` makes the page of a run."""
+    """Returns the exit status for a scheduler, and one line for a person; `render` makes the page of a
+    run."""
     from pipeline.nightly import by_hand, night, reporting
 
     if arguments.accept_drift:

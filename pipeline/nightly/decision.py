@@ -1,4 +1,5 @@
-"""Champion and challenger on the same cases -> promote or keep, with every number that decided."""
+"""Compares champion and challenger on the same cases, and promotes or keeps, with every number that
+decided."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -12,8 +13,8 @@ from pipeline.verdict.digits import THIN, beyond_meaning
 
 
 class CaseCosts(NamedTuple):
-    """What the judge measured of one controller: {case: (block, cost)}, {guard: figure, less is better}, and
-    the name of the panel, which two must share to be compared."""
+    """Measured results of one controller: `cases` {case: (block, cost)}; `guards` {guard: figure, less is
+    better}; `panel`, the name of the test set, which must be equal if two controllers are compared."""
 
     panel: str
     cases: dict[str, tuple[str, float]]
@@ -29,9 +30,9 @@ def decide(
     alarms: Sequence[Alarm],
     seed: int,
 ) -> LoopDecision:
-    """Promote where the paired test finds the challenger better by at least `rule.least_improvement_percent`,
-    no guard is worse by more than `allowed`, and nothing has drifted: `alarms` are those of this loop
-    alone."""
+    """Promotes the challenger if the paired test finds it better by at least
+    `rule.least_improvement_percent`, no guard is worse by more than `allowed`, and nothing has drifted; else
+    keeps the champion. `alarms`: those of this loop only."""
     if champion is None:
         return _first(challenger)
     if champion.panel != challenger.panel:
@@ -62,7 +63,7 @@ def decide(
 
 
 def _first(challenger: CaseCosts) -> LoopDecision:
-    """Where there is no champion, a challenger that is fit becomes one."""
+    """Returns the decision if there is no champion: a challenger without failures becomes the first one."""
     failing = [case for case, (_, cost) in challenger.cases.items() if not np.isfinite(cost)]
     reasons = _unfit(challenger)
     if not challenger.cases:
@@ -88,17 +89,17 @@ def _unfit(challenger: CaseCosts) -> list[str]:
 
 
 def _percent(value: float) -> str:
-    """ "5.0 %"; "beyond 1,000 %" where the figure says nothing."""
+    """Returns "5.0 %"; "beyond 1,000 %" if the figure has no meaning."""
     return beyond_meaning(value, "%").replace(THIN, " ") or f"{_tenths(value)} %"
 
 
 def _tenths(value: float) -> str:
-    """ "5.0"; of what rounds to nothing no sign."""
+    """Returns "5.0"; without a sign if it rounds to zero."""
     return f"{round(value, 1) + 0.0:.1f}"
 
 
 def _band(low: float, high: float) -> str:
-    """ "4.0 to 6.0 %"."""
+    """Returns "4.0 to 6.0 %"."""
     return f"{_percent(low) if beyond_meaning(low, '%') else _tenths(low)} to {_percent(high)}"
 
 

@@ -1,20 +1,23 @@
-"""Has the machine changed since the champion was made? Rival changes of one recording, each fitted by itself,
-and the one named that explains most: a gain, a time constant, a delay, a heater's cap, a sensor's offset.
+"""Has the machine changed since the champion was made? Several possible changes of one recording are fitted,
+each by itself, and the one that explains most is named: a gain, a time constant, a delay, a heater's cap, or
+a sensor's offset.
 
-The generalised likelihood ratio (Willsky and Jones 1976; Basseville and Nikiforov 1993, ch. 4). The
-champion's model predicts the outputs of the recording under a change theta of one cause c; what is left goes
-through the observer's filter S(q) = I - C (qI - A + K C)^-1 K, which makes it the one-step errors, and
+This is the generalised likelihood ratio (Willsky and Jones 1976; Basseville and Nikiforov 1993, ch. 4). The
+champion's model predicts the outputs of the recording under a change theta of one cause c. The remaining
+error passes through the observer's filter S(q) = I - C (qI - A + K C)^-1 K, which makes it the one-step
+errors. Their cost is
 
     J_c = min over theta, z of |S (y - y-hat(theta)) - Z z|^2 / variance + |z / spread|^2
 
-counts it. z is what says nothing of the machine: each segment's initial state, the air around (a
-level and a slow course, which warm every output alike), and the level by which honest nights differ, output
-by output. Their spreads are those of the champion's own recordings (a mixed model; Robinson 1991).
-J_0 - J_c is what the cause explains. The largest is named, made part of the prediction, and the rest asked
-again, so that one change hides no other.
+z describes what is no change of the machine: each segment's initial state, the ambient air (a level and a
+slow course, which warm every output alike), and the level by which honest nights differ, for each output.
+Their spreads are those of the champion's own recordings (a mixed model; Robinson 1991).
 
-A level thus counts in °C of the steady output whatever the observer, and a gain by its dynamics and
-its level together.
+J_0 - J_c is what the cause explains. The cause with the largest value is named and added to the prediction,
+and the other causes are fitted again, so that one change hides no other.
+
+So a level counts in °C of the steady output whatever the observer, and a gain by its dynamics and its level
+together.
 """
 
 import functools
@@ -29,55 +32,55 @@ import scipy.stats
 from pipeline.temperature.identification.refinement import Predictor, free_response, linear_recurrence
 from pipeline.temperature.plant import Plant, clip_spectral_radius
 
-BLOCKS = 12  # into which a record is cut for the variance of an estimate
-SHORTEST = 96  # samples of a record that is asked
+BLOCKS = 12  # blocks of a record, for the variance of an estimate
+SHORTEST = 96  # samples that a record must have
 COURSE = 8  # degree of the polynomial that the air around may follow within a segment
-# by kind of cause: the step of a derivative, and the ends between which it is looked for; a delay that is
-# longer is a mistake of the record
+# by kind of cause: the step of a derivative, and the range of the search; a delay that is longer is a
+# recording mistake
 RANGES = {
     "gain": (0.02, -0.98, 1.0), "time constant": (0.02, -0.6, 1.5), "offset": (0.1, -60.0, 60.0),
     "delay": (1.0, -16.0, 64.0), "late sensor": (1.0, -16.0, 64.0),
 }  # fmt: skip
-GUESSES = dict.fromkeys(("delay", "late sensor"), (6.0, 20.0, 40.0))  # where the search may begin, beside 0
-ENOUGH = 0.01  # of the squared error: steps that win less are not taken
-SURE = 5.0  # a cause is named from so many sigmas on, squared: what it explains beyond the noise
-# of what the first cause explains, a second one must explain so much: less is what the model gets wrong of it
+GUESSES = dict.fromkeys(("delay", "late sensor"), (6.0, 20.0, 40.0))  # starts of the search, besides 0
+ENOUGH = 0.01  # reduction of the squared error below which a step is not taken
+SURE = 5.0  # sigmas from which a cause is named; squared, the least that it must explain
+# a second cause must explain this fraction of what the first explains; less may be model error of the first
 REMAINDER = 0.004
 RIVALS = 4.0  # a rival that explains less by up to this (two sigmas squared) is named too
-# by so much more than the champion's own errors must draughts explain a record: they also cover what changed
+# draughts must explain a record better by this much, because they can also hide a change of the machine
 DRAUGHTY = 30.0
 CALM = 0.2  # °C of the course of the air in a closed room
 SEASON = 20.0  # °C by which another season's air may differ
-UNLIKE = 0.1  # share of the air's course by which one output may follow it otherwise than the others
-CAUSE = 10.0  # by so much more must a cause explain than another season's air
+UNLIKE = 0.1  # fraction of the air's course by which one output may follow it differently from the others
+CAUSE = 10.0  # by this much more must a cause explain than another season's air
 MOST = 3  # causes of one record
-LOST = 0.04  # share of what is asked of a heater: if its cap takes less, nobody needs to know
+LOST = 0.04  # fraction of a heater's command: if its cap removes less, it does not matter
 
 Segments = Sequence[tuple[np.ndarray, np.ndarray]]
 
 
 class DriftCause(NamedTuple):
-    """One way in which a machine can change: kind, and the number of the input (gain, time
-    constant, delay, saturation) or output (offset, late sensor); -1 for all."""
+    """One way in which a machine can change: its kind, and the number of the input (gain, time constant,
+    delay, saturation) or output (offset, late sensor); -1 for all."""
 
     kind: str
     channel: int
 
 
-# of a machine against the model, one after the other: a share of a gain or of a rate (the inverse of a time
-# constant), samples of a delay or of a late sensor, the most that acts of an input, °C of an offset
+# changes of a machine from the model, one after the other: fraction of a gain or of a rate (the inverse of a
+# time constant), samples of a delay or of a late sensor, the largest effective input, °C of an offset
 Changes = tuple[tuple[DriftCause, float], ...]
 
 
 def sizes(changes: Changes, kind: str, channel: int) -> list[float]:
-    """The changes of one kind that concern a channel."""
+    """Returns the changes of one kind that concern a channel."""
     return [value for cause, value in changes if cause.kind == kind and cause.channel in (channel, -1)]
 
 
 class Scatter(NamedTuple):
-    """What honest records scatter by: variance (p,) of the one-step errors, standard deviation of the air
-    around between nights, and (p,) of each output's level between nights; mean level of each output in °C
-    (p,)."""
+    """Scatter of honest records: `variance` (p,) of the one-step errors; `ambient`, standard deviation of the
+    ambient air between nights; `level` (p,), that of each output's level between nights; `mean_level` of each
+    output in °C (p,)."""
 
     variance: np.ndarray
     ambient: float
@@ -86,9 +89,9 @@ class Scatter(NamedTuple):
 
 
 class RoomAir(NamedTuple):
-    """How restless a record is: standard deviation in °C of the course of the air within it, and of what
-    draughts take from one sample to the next, in percent of each input; then whether the air may be farther
-    from the champion's nights than those are from each other."""
+    """How restless the air in a record is. `course`: standard deviation in °C of the air's slow course;
+    `draught`: what draughts take from one sample to the next, in percent of each input; `another_season`:
+    whether the air may be further from that of the champion's nights than those differ from each other."""
 
     course: float
     draught: float
@@ -104,8 +107,8 @@ ROOMS = (
 
 
 class CauseFit(NamedTuple):
-    """Of one cause, as if it alone had changed: `value` in the unit of `Changes`, its standard deviation, and
-    the fall of the weighted squared error that it explains."""
+    """Fit of one cause, as if it alone had changed: `value` in the unit of `Changes`, its standard deviation,
+    and the reduction of the weighted squared error that it explains."""
 
     cause: DriftCause
     value: float
@@ -114,7 +117,8 @@ class CauseFit(NamedTuple):
 
 
 def causes(plant: Plant) -> list[DriftCause]:
-    """Every cause that a record is asked for: those of inputs with all together last, those of outputs."""
+    """Returns every cause that is fitted to a record: those of inputs, each kind with all inputs together
+    last, then those of outputs."""
     inputs = [
         DriftCause(kind, j)
         for kind in ("gain", "time constant", "delay")
@@ -129,11 +133,11 @@ def causes(plant: Plant) -> list[DriftCause]:
 
 
 def faster(plant: Plant, share: float) -> Plant:
-    """The plant with every rate 1 + share as high, its time constants 1 / (1 + share) as long, its steady
-    gains the same: expm((1 + share) log [A B b; 0 I]).
+    """Returns the plant with every rate 1 + share times as high, its time constants 1 / (1 + share) times as
+    long, and its steady gains the same: expm((1 + share) log [A B b; 0 I]).
 
-    A plant whose logarithm is not real (dead times, poles on the negative axis) has
-    its slow modes quickened, I - (1 + share) (I - A).
+    If that logarithm is not real (dead times, poles on the negative axis), only the slow modes are made
+    faster, I - (1 + share) (I - A).
     """
     n, m, rate = plant.n, plant.m, 1.0 + share
     augmented = np.block([[plant.A, plant.B, plant.b[:, None]], [np.zeros((m + 1, n)), np.eye(m + 1)]])
@@ -153,14 +157,15 @@ def faster(plant: Plant, share: float) -> Plant:
 
 
 def respond(plant: Plant, j: int, u: np.ndarray) -> np.ndarray:
-    """y (T, p) of input j alone, u (T,), from the equilibrium under u(0)."""
+    """Returns y (T, p), the response to input j alone, u (T,), from the equilibrium at u(0)."""
     x0 = np.linalg.solve(np.eye(plant.n) - plant.A, plant.B[:, j] * u[0])
     x = linear_recurrence(plant.A, np.outer(u, plant.B[:, j]), x0)[:-1]
     return x @ plant.C.T + np.outer(u, plant.D[:, j])
 
 
 def shifted(values: np.ndarray, samples: float) -> np.ndarray:
-    """values (T, ...) so many samples later, between samples by a straight line; the ends are held."""
+    """Returns values (T, ...) delayed by `samples`, with linear interpolation between samples; the end values
+    are repeated."""
     if not samples:
         return values
     at = np.clip(np.arange(len(values)) - samples, 0, len(values) - 1)
@@ -170,8 +175,8 @@ def shifted(values: np.ndarray, samples: float) -> np.ndarray:
 
 
 class ProductionModel:
-    """The champion's model, ready to be asked: a plant that is stable over the record, its observer's
-    gain K (n, p), and `faster`, the plant with its rates so much higher, worked out once."""
+    """The champion's model, prepared for the fits: `plant`, made stable over the record; `K` (n, p), its
+    observer's gain; and `faster(share)`, the plant with faster rates, cached."""
 
     def __init__(self, plant: Plant, samples: int):
         self.plant = plant._replace(A=clip_spectral_radius(plant.A, 1.0 - 1.0 / max(samples, 10)))
@@ -180,7 +185,8 @@ class ProductionModel:
         self.faster = functools.cache(lambda share: faster(self.plant, share) if share else self.plant)
 
     def gain(self, draught: float, variance: np.ndarray) -> np.ndarray:
-        """Kalman's gain (n, p) where draughts take so many percent from each input, sample by sample."""
+        """Returns Kalman's gain (n, p) if draughts take `draught` percent from each input, sample by
+        sample."""
         A, B, C = self.plant.A, self.plant.B, self.plant.C
         if not draught:
             return self.K
@@ -192,7 +198,8 @@ class ProductionModel:
         return A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + np.diag(variance))
 
     def innovation(self, values: np.ndarray, K: np.ndarray) -> np.ndarray:
-        """S(q) values (T, p): what the observer of gain K does not foresee of an error of the output."""
+        """Returns S(q) values (T, p): the part of an output error that the observer of gain K does not
+        predict."""
         if not K.any():
             return values
         x = linear_recurrence(self.plant.A - K @ self.plant.C, values @ K.T, np.zeros(self.plant.n))[:-1]
@@ -200,8 +207,9 @@ class ProductionModel:
 
 
 class RecordSegment(NamedTuple):
-    """Of a record: u (T, m), y (T, p), where y was measured (T, p), the answers of inputs worked out so
-    far, its own nuisances with the rows that hold them to their spread, and their orthonormal basis."""
+    """A segment of a record: `u` (T, m); `y` (T, p); `measured` (T, p), where y was measured; `answers`,
+    cached responses to inputs; `columns`, its own nuisances z with the rows that weigh them by their spread;
+    `basis`, their orthonormal basis."""
 
     u: np.ndarray
     y: np.ndarray
@@ -212,8 +220,9 @@ class RecordSegment(NamedTuple):
 
 
 class DriftRecord(NamedTuple):
-    """Segments held against a machine at a scale by an observer of gain K; `basis` is that of the outputs'
-    levels, which all segments share, and `common` (N, p) those levels before they were made orthonormal."""
+    """Segments prepared for comparison with a machine at a scale, by an observer of gain K. `basis`:
+    orthonormal, of the outputs' levels, which all segments share; `common` (N, p): those levels before they
+    were made orthonormal."""
 
     machine: ProductionModel
     scale: Scatter
@@ -226,7 +235,7 @@ class DriftRecord(NamedTuple):
 def record(
     machine: ProductionModel, segments: Segments, scale: Scatter, room: RoomAir = RESTLESS
 ) -> DriftRecord:
-    """A record ready to be asked. Raises ValueError where it is too short."""
+    """Prepares a record for the fits. Raises ValueError if it is too short."""
     n, p = machine.plant.n, machine.plant.p
     long = [(u, y) for u, y in segments if len(y) >= 4 * n + 8]
     measured = sum(int(np.isfinite(y).any(axis=1).sum()) for _, y in long)
@@ -251,15 +260,16 @@ def record(
 
 
 def _in(scale: Scatter, room: RoomAir) -> Scatter:
-    """The scale where the air is restless, or of another season: outputs follow it alike, but not exactly."""
+    """Returns the scale for restless air or air of another season, which outputs follow alike, but not
+    exactly."""
     ambient = max(scale.ambient, SEASON) if room.another_season else scale.ambient
     apart = np.hypot(UNLIKE * room.course, 0.5 * UNLIKE * SEASON if room.another_season else 0.0)
     return scale._replace(ambient=ambient, level=np.hypot(scale.level, apart))
 
 
 def _own_nuisances(machine: ProductionModel, T: int, scale: Scatter, course: float) -> np.ndarray:
-    """(T, p, n + 1 + COURSE): what the state at the start does, then level and courses of the air around,
-    which warms like inputs that would raise every steady output by 1 °C."""
+    """Returns the nuisances (T, p, n + 1 + COURSE): effects of the initial state, then the level and courses
+    of the ambient air. The air acts like inputs that would raise every steady output by 1 °C."""
     plant = machine.plant
     A = plant.A
     start = free_response(Predictor(A, np.zeros((plant.n, 1)), plant.C, np.zeros((plant.p, 1)), []), T)
@@ -277,8 +287,8 @@ def _own_nuisances(machine: ProductionModel, T: int, scale: Scatter, course: flo
 
 
 def _weighted(record: DriftRecord, values: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """values (T, p, k) in °C as one-step errors in their own standard deviation, (T p, k); what was not
-    measured counts nothing."""
+    """Returns values (T, p, k) in °C as one-step errors in units of their standard deviation, (T p, k); 0 if
+    not measured."""
     T, p, k = values.shape
     made = np.stack([record.machine.innovation(values[:, :, c], record.K) for c in range(k)], axis=2)
     made = made / np.sqrt(record.scale.variance)[:, None] * measured[:, :, None]
@@ -286,7 +296,7 @@ def _weighted(record: DriftRecord, values: np.ndarray, measured: np.ndarray) -> 
 
 
 def _held(columns: np.ndarray, free: int) -> np.ndarray:
-    """Columns (N, k) with k rows below that hold all but the first `free` to unit variance."""
+    """Appends k rows to columns (N, k) that give all but the first `free` coefficients unit variance."""
     k = columns.shape[1]
     return np.vstack([columns, np.diag(np.concatenate([np.full(free, 1e-6), np.ones(k - free)]))])
 
@@ -296,14 +306,14 @@ def _padded(values: np.ndarray, rows: int) -> np.ndarray:
 
 
 def _freed(record: DriftRecord, parts: Sequence[np.ndarray]) -> np.ndarray:
-    """parts (T p, k) of each segment free of its own nuisances, one below the other."""
+    """Removes each segment's own nuisances from its part (T p, k), and stacks the parts."""
     padded = [_padded(part, len(one.basis)) for one, part in zip(record.segments, parts, strict=True)]
     pairs = zip(record.segments, padded, strict=True)
     return np.concatenate([part - one.basis @ (one.basis.T @ part) for one, part in pairs])
 
 
 def predicted(machine: ProductionModel, one: RecordSegment, changes: Changes) -> np.ndarray:
-    """y-hat (T, p) of a segment with these changes."""
+    """Returns y-hat (T, p) of a segment with these changes."""
     plant = machine.plant
     y = np.tile(plant.C @ np.linalg.solve(np.eye(plant.n) - plant.A, plant.b) + plant.d, (len(one.u), 1))
     for j in range(plant.m):
@@ -323,16 +333,16 @@ def predicted(machine: ProductionModel, one: RecordSegment, changes: Changes) ->
 
 
 def left(record: DriftRecord, changes: Changes) -> np.ndarray:
-    """The one-step errors (N,) under these changes, in their own standard deviation and free of every
-    nuisance, with what those cost."""
+    """Returns the one-step errors (N,) under these changes, in units of their standard deviation and without
+    every nuisance, followed by the cost of the nuisances."""
     Q = record.basis
     padded = _padded(_freed(record, _errors(record, changes))[:, 0], len(Q))
     return padded - Q @ (Q.T @ padded)
 
 
 def _errors(record: DriftRecord, changes: Changes) -> list[np.ndarray]:
-    """(T p, 1) of each segment before any nuisance is taken off; what was not measured by a straight line
-    between its neighbours."""
+    """Returns the errors (T p, 1) of each segment before any nuisance is removed. Values that were not
+    measured are interpolated linearly between their neighbours."""
     parts = []
     for one in record.segments:
         error = one.y - predicted(record.machine, one, changes) - record.scale.mean_level
@@ -345,7 +355,7 @@ def _errors(record: DriftRecord, changes: Changes) -> list[np.ndarray]:
 
 
 def by_output(record: DriftRecord, rest: np.ndarray) -> np.ndarray:
-    """(samples, p) in °C of errors (N,) that `left` gave; NaN where nothing was measured."""
+    """Returns errors (N,) of `left` as (samples, p) in °C; NaN if not measured."""
     parts, at, p = [], 0, record.machine.plant.p
     for one in record.segments:
         part = rest[at : at + one.y.size].reshape(-1, p) * np.sqrt(record.scale.variance)
@@ -357,8 +367,8 @@ def by_output(record: DriftRecord, rest: np.ndarray) -> np.ndarray:
 def room_of(
     machine: ProductionModel, segments: Segments, scale: Scatter, changes: Changes
 ) -> tuple[Scatter, RoomAir]:
-    """The surroundings under which what is left of the record is likeliest, and the scale there: of draughts
-    the one-step errors are larger than the champion's own, and the record itself says by how much."""
+    """Returns the surroundings that make the remaining errors likeliest, and the scale there. With draughts
+    the one-step errors are larger than the champion's own; their size is estimated from the record."""
     rooms = []
     for room in ROOMS:
         there = scale
@@ -375,13 +385,14 @@ def room_of(
 
 
 def _log_determinant(record: DriftRecord) -> float:
-    """log det of the errors' covariance by what the nuisances add to it."""
+    """Returns the part of log det of the errors' covariance that the nuisances add."""
     columns = [*(one.columns for one in record.segments), _held(record.common, 0)]
     return float(sum(2 * np.log(np.abs(np.diag(np.linalg.qr(one, mode="r")))).sum() for one in columns))
 
 
 def levels(record: DriftRecord, changes: Changes) -> tuple[float, np.ndarray]:
-    """°C by which the air around differs from what the model knows, and each output's own level (p,)."""
+    """Returns the difference of the ambient air from what the model assumes in °C, and each output's own
+    level (p,) in °C."""
     rows, n = _held(record.common, 0), record.machine.plant.n
     errors = _padded(_freed(record, _errors(record, changes))[:, 0], len(rows))
     own = np.linalg.lstsq(rows, errors, rcond=None)[0] * record.scale.level
@@ -401,8 +412,8 @@ def levels(record: DriftRecord, changes: Changes) -> tuple[float, np.ndarray]:
 def fitted(
     record: DriftRecord, changes: Changes, cause: DriftCause, start: np.ndarray | None = None
 ) -> CauseFit:
-    """The change of one cause that explains most beside `changes` (Gauss and Newton's steps); `start` (N,)
-    are the errors left without it."""
+    """Fits the change of one cause that explains most in addition to `changes` (Gauss-Newton steps). `start`
+    (N,): errors without it."""
 
     def errors(value: float) -> np.ndarray:
         return left(record, (*changes, (cause, value)))
@@ -428,8 +439,8 @@ def fitted(
 
 
 def _deviation(psi: np.ndarray, e: np.ndarray) -> float:
-    """Standard deviation of an estimate with sensitivity psi (N,) and errors e (N,): no less than white ones
-    give, and robust to colour by the blocks' own scores."""
+    """Returns the standard deviation of an estimate with sensitivity psi (N,) and errors e (N,). It is at
+    least that of white errors, and robust to coloured ones by the blocks' own scores."""
     information = max(float(psi @ psi), 1e-30)
     scores = np.array([block.sum() for block in np.array_split(psi * e, BLOCKS)])
     return float(np.sqrt(max((scores**2).sum() * BLOCKS / (BLOCKS - 1), information)) / information)
@@ -438,8 +449,8 @@ def _deviation(psi: np.ndarray, e: np.ndarray) -> float:
 def _capped(
     record: DriftRecord, cause: DriftCause, before: np.ndarray, errors: Callable[[float], np.ndarray]
 ) -> CauseFit:
-    """The level above which an input has no effect: the best of a fine grid, then between its neighbours
-    (Brent's method)."""
+    """Fits the level above which an input has no effect: the best of a fine grid, then refined between its
+    neighbours (Brent's method)."""
     u = np.concatenate([one.u[:, cause.channel] for one in record.segments])
     low, high = float(u.min()), float(u.max())
     if high - low < 1e-6:
@@ -460,13 +471,14 @@ def _capped(
 
 
 def above(segments: Segments, j: int, level: float) -> float:
-    """Percent of the samples in which so much more than `level` is asked of input j that it matters."""
+    """Returns the percentage of samples in which input j is commanded above `level` by an amount that
+    matters."""
     return 100 * float(np.mean(np.concatenate([u[:, j] for u, _ in segments]) > (1 + LOST) * level))
 
 
 def moved(record: DriftRecord, changes: Changes, now: Changes) -> np.ndarray:
-    """°C (p,) by which the outputs' level differs between two states of the machine under the record's
-    inputs."""
+    """Returns by how many °C (p,) the outputs' level differs between two states of the machine under the
+    record's inputs."""
     outputs = (
         np.concatenate([predicted(record.machine, one, state) for one in record.segments])
         for state in (now, changes)
@@ -475,7 +487,7 @@ def moved(record: DriftRecord, changes: Changes, now: Changes) -> np.ndarray:
 
 
 def alone(record: DriftRecord, changes: Changes) -> list[CauseFit]:
-    """Every cause, each as if it alone had changed."""
+    """Fits every cause, each as if it alone had changed."""
     before = left(record, changes)
     return [fitted(record, changes, cause, before) for cause in causes(record.machine.plant)]
 
@@ -484,15 +496,15 @@ def alone(record: DriftRecord, changes: Changes) -> list[CauseFit]:
 
 
 class NamedCause(NamedTuple):
-    """A change that explains the record, with the rivals that it cannot be told from."""
+    """A change that explains the record, with the rivals from which it cannot be distinguished."""
 
     fit: CauseFit
     rivals: list[CauseFit]
 
 
 class Explanation(NamedTuple):
-    """Of a record: the causes that are named, the largest first, what the others seem beside them, all
-    changes together, and the errors (N,) left."""
+    """Explanation of a record: the named causes, the largest first; the estimates of the others beside them;
+    all changes together; and the remaining errors (N,)."""
 
     named: list[NamedCause]
     others: list[CauseFit]
@@ -501,8 +513,8 @@ class Explanation(NamedTuple):
 
 
 def explain(record: DriftRecord, changes: Changes, usual: Mapping[DriftCause, float]) -> Explanation:
-    """Names what changed beside `changes`, one cause after the other; `usual` is what each cause explains of
-    the champion's own records at most, which is no change of the machine."""
+    """Names what changed in addition to `changes`, one cause after the other. `usual`: the most that each
+    cause explains on the champion's own records, which is no change of the machine."""
     now, fits, found = changes, alone(record, changes), []
     while len(found) < MOST:
         remainder = REMAINDER * found[0].fit.explained if found else 0.0
@@ -513,7 +525,7 @@ def explain(record: DriftRecord, changes: Changes, usual: Mapping[DriftCause, fl
             else -np.inf
             for fit in fits
         ])  # fmt: skip
-        # transport is commoner than a late sensor, which is named if it explains more
+        # a transport delay is commoner than a late sensor, so a late sensor must explain more to be named
         behind = [RIVALS * _colour(fit) if fit.cause.kind == "late sensor" else 0.0 for fit in fits]
         best = int((worth - behind).argmax())
         if not np.isfinite(worth[best]):
@@ -535,9 +547,9 @@ def explain_segments(
     changes: Changes,
     usual: Mapping[DriftCause, float],
 ) -> tuple[DriftRecord, Explanation]:
-    """A record explained in the surroundings that it was made in: asked first in restless ones, which
-    cost the least to take for calm. What only another season's air tells from a change of the machine is
-    decided by what explains more."""
+    """Explains a record in the surroundings in which it was made. A restless room is assumed first, because
+    this does least harm if the room was calm. If air of another season is an alternative to a change of the
+    machine, the explanation with the lower cost is taken."""
     asked = record(machine, segments, scale)
     explained = explain(asked, changes, usual)
     there, room = room_of(machine, segments, scale, explained.changes)
@@ -558,14 +570,15 @@ def _cost(candidate: tuple[DriftRecord, Explanation]) -> float:
 
 
 def _from_none(fit: CauseFit) -> float:
-    """Sigmas of a change from none; a cap has none to be measured from."""
+    """Returns the distance of a change from no change in sigmas; for a cap, which has no such value, from
+    what it explains."""
     if fit.cause.kind == "saturation":
         return np.sqrt(fit.explained)
     return fit.value / fit.deviation
 
 
 def _colour(fit: CauseFit) -> float:
-    """Variance of the estimate in that of white errors, from 1 on."""
+    """Returns the variance of the estimate relative to that with white errors, at least 1."""
     if fit.cause.kind == "saturation":
         return 1.0
     return max(1.0, fit.explained * (fit.deviation / max(abs(fit.value), 1e-12)) ** 2)
@@ -574,7 +587,7 @@ def _colour(fit: CauseFit) -> float:
 def _polished(
     record: DriftRecord, changes: Changes, found: list[NamedCause]
 ) -> tuple[list[NamedCause], Changes]:
-    """Several causes fitted beside each other, in turns."""
+    """Fits several causes together, one after the other in turns."""
     for _ in range(3):
         for k, named in enumerate(found):
             others = [other.fit[:2] for other in found if other is not named]
@@ -586,8 +599,8 @@ def _polished(
 
 
 class Shift(NamedTuple):
-    """How far a figure has moved from its reference: value and reference, the standard deviation of their
-    difference, and the ratio `sigmas`."""
+    """How far a figure has moved from its reference: value, reference, the standard deviation of their
+    difference, and their difference in `sigmas`."""
 
     value: np.ndarray
     reference: np.ndarray
@@ -604,13 +617,13 @@ def shift(
     freedom: int = BLOCKS - 1,
     nights: int = 0,
 ) -> Shift:
-    """value (k,) against those of the reference nights before (rows, k): their mean, and as noise both
-    nights' own and what they scatter beyond it (DerSimonian and Laird 1986). `nights` is how many of the rows
-    are independent, 0 if all are.
+    """Compares value (k,) with the mean of the reference nights before (rows, k). The noise is that of both
+    nights' own deviations and of the scatter between nights beyond it (DerSimonian and Laird 1986). `nights`:
+    number of independent rows, 0 if all are.
 
-    A night's own deviation has `freedom`, the scatter of a few nights less: both count with the
-    degrees of freedom that they have (Satterthwaite 1946), and the ratio is brought to the sigmas
-    that a normal variable would need to be as unlikely.
+    A night's own deviation has `freedom` degrees of freedom, the scatter of a few nights fewer; both are
+    combined (Satterthwaite 1946). The ratio is converted to the sigmas at which a normal variable would be
+    equally unlikely.
     """
     nights = nights or len(before)
     inside = (before_deviation**2).mean(axis=0)

@@ -1,5 +1,5 @@
-"""What a night depends on, as one digest, so that a night with nothing new ends in seconds; which recordings
-are new, and where those go that cannot be learned from; what of it no commit holds."""
+"""The inputs of a nightly run, as one digest, so that a run with nothing new ends in seconds. Also finds
+which recordings are new, moves those that cannot be learned from, and lists changes that are in no commit."""
 
 import hashlib
 import itertools
@@ -22,8 +22,8 @@ QUARANTINE = Path("datasets/quarantine")
 
 
 def sources() -> list[str]:
-    """Files and folders that dvc.yaml's stages read and none of them writes;
-    the files of parameters and dvc.yaml with them."""
+    """Returns the files and folders that dvc.yaml's stages read and no stage writes, with the parameter files
+    and dvc.yaml."""
     stages = read_stages("dvc.yaml").values()
     made = [out for stage in stages for out in outs_of(stage)]
     read = {dep for stage in stages for dep in stage.get("deps", [])}
@@ -36,9 +36,10 @@ def sources() -> list[str]:
 
 
 def contents(places: Iterable[str], stamps: dict[str, list]) -> dict[str, str]:
-    """{path: SHA-256} of all files at or below `places` that a stage would read. `stamps` remembers {path:
-    [size, time of change, inode, digest]}, so that a gigabyte that did not change is not read every
-    night. Raises ValueError for a name that is no text, for what is no file, and for what cannot be read."""
+    """Returns {path: SHA-256} of all files at or below `places` that a stage would read. `stamps` caches
+    {path: [size, time of change, inode, digest]}, so that unchanged gigabytes are not read in every run.
+    Raises ValueError for a name that is no text, for something that is no file, and for a file that cannot be
+    read."""
     found = [path for place in places for path in (Path(place), *sorted(Path(place).rglob("*")))]
     files = [path for path in found if path.is_symlink() or (path.exists() and not path.is_dir())]
     digests = {}
@@ -61,8 +62,8 @@ def contents(places: Iterable[str], stamps: dict[str, list]) -> dict[str, str]:
 
 
 def _check(file: Path) -> None:
-    """Raises ValueError if the name of a file is no text, which no JSON can hold, or if it is no file that
-    can be read to its end."""
+    """Raises ValueError if a file's name is no text, which JSON cannot store, or if it is not a regular
+    file."""
     try:
         file.as_posix().encode()
     except UnicodeEncodeError:
@@ -74,7 +75,7 @@ def _check(file: Path) -> None:
 
 
 def digest(digests: Mapping[str, str]) -> str:
-    """One digest over names and contents."""
+    """Returns one digest over names and contents."""
     total = hashlib.sha256()
     for name, content in sorted(digests.items()):
         total.update(f"{name}\0{content}\n".encode())
@@ -82,9 +83,9 @@ def digest(digests: Mapping[str, str]) -> str:
 
 
 def recordings(digests: Mapping[str, str], loop: NightlyLoop) -> dict[str, str]:
-    """{path: digest} of the recordings below a loop's folder, of all that was found; notes and files of dvc
-    are none, nor is what is excluded. A bag of ROS 2 is one recording, as `ingest` reads it, under the path
-    of its folder."""
+    """Returns {path: digest} of the recordings below a loop's folder. Notes, files of dvc and excluded
+    recordings are left out. A ROS 2 bag is one recording, as `ingest` reads it, under the path of its
+    folder."""
     folder, notes = loop.recordings, (".md", ".txt", ".yaml", ".dvc")
     if not folder:
         return {}
@@ -105,12 +106,12 @@ def recordings(digests: Mapping[str, str], loop: NightlyLoop) -> dict[str, str]:
 
 
 def within(name: str, folder: str) -> bool:
-    """Whether a path lies below a folder."""
+    """Returns whether a path lies below a folder."""
     return name.startswith(f"{folder}/")
 
 
 def lies_in(name: str, places: Iterable[str]) -> bool:
-    """Whether a path is one of these, or lies below one."""
+    """Returns whether a path is one of these, or lies below one."""
     return any(name == place or within(name, place) for place in places)
 
 
@@ -118,9 +119,10 @@ def lies_in(name: str, places: Iterable[str]) -> bool:
 
 
 def quarantine(path: str, loop: str, reason: str) -> str:
-    """Sets a recording aside, a file or a bag, and returns the reason. It is moved, unchanged, to
-    datasets/quarantine. What git or DVC keeps stays where it is, and is listed in excluded.yaml of its loop's
-    folder. A copy that is not complete stays: it is another recording when it is."""
+    """Sets a recording aside, a file or a bag, and returns the reason. It is moved unchanged to
+    datasets/quarantine. If git or DVC keeps it, it is not moved but listed in excluded.yaml of its loop's
+    folder. If it is still being written, it is left in place, and counts as another recording once
+    complete."""
     if plain_files.wait_until_still([Path(path)]):
         return f"{reason} (it is still being written: it stays, and is looked at again)"
     if kept_by := keeper(Path(path)):
@@ -132,8 +134,8 @@ def quarantine(path: str, loop: str, reason: str) -> str:
 
 
 def move_aside(path: str, loop: str, reason: str) -> None:
-    """Moves a recording to datasets/quarantine, where no stage looks and git does not either, its reason
-    beside it; nothing there is overwritten."""
+    """Moves a recording to datasets/quarantine, which stages and git ignore, and writes the reason beside it.
+    Nothing there is overwritten."""
     name, aside = Path(path), QUARANTINE / loop
     aside.mkdir(parents=True, exist_ok=True)
     if not (QUARANTINE / ".gitignore").exists():
@@ -145,8 +147,8 @@ def move_aside(path: str, loop: str, reason: str) -> None:
 
 
 def keeper(path: Path) -> str:
-    """Who has a version of what lies here: git, DVC, or nobody, which is empty. If the cache lacks the list
-    of a folder's files, DVC is taken to have it: what stays is not lost."""
+    """Returns who has a version of what lies here: "git", "DVC", or "" for nobody. If the cache lacks the
+    list of a folder's files, DVC is assumed to have it, so that nothing is lost."""
     if git("ls-files", "--", str(path), check=False):
         return "git"
     pointers = [folder.with_name(f"{folder.name}.dvc") for folder in (path, *path.parents) if folder.name]
@@ -163,7 +165,7 @@ def keeper(path: Path) -> str:
 
 
 def read_lists(settings: Nightly, copy: Path) -> dict[str, str]:
-    """{path: text} of the lists of excluded recordings that lie in the copy."""
+    """Returns {path: text} of the lists of excluded recordings in the copy."""
     paths = [Path(loop.recordings) / excluded.FILE for loop in settings.loops.values() if loop.recordings]
     lists = [path for path in paths if (copy / path).is_file()]
     return {path.as_posix(): (copy / path).read_text(encoding="utf-8") for path in lists}
@@ -173,15 +175,15 @@ def read_lists(settings: Nightly, copy: Path) -> dict[str, str]:
 
 
 def recorded_places(settings: Nightly) -> list[str]:
-    """Where recordings lie; of a folder that DVC keeps, git keeps the pointer alone."""
+    """Returns the places of recordings. For a folder that DVC keeps, this is the pointer in git."""
     places = [*(loop.recordings for loop in settings.loops.values()), settings.holdout.recordings]
     pointers = {place: f"{place}.dvc" for place in places if place}
     return [pointer if Path(pointer).exists() else place for place, pointer in pointers.items()]
 
 
 def find_uncommitted(settings: Nightly) -> list[str]:
-    """Code, parameters and other sources that differ from the last commit, or are in none. What a night's own
-    commit holds, recordings among it, is none of these."""
+    """Returns code, parameters and other sources that differ from the last commit, or are in none. Files that
+    a run commits itself, such as recordings, are left out."""
     own = [
         "dvc.lock",
         "reports",

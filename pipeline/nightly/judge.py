@@ -1,5 +1,5 @@
-"""A controller's files -> evidence: the temperature loop on a frozen panel of plants that nothing was learned
-from; any loop from a file of costs by case."""
+"""Measures the evidence on a controller from its files. The temperature loop is tested on a frozen test set
+of plants that were never learned from; any loop can be tested by a file of costs by case."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -28,13 +28,13 @@ from stages.ingest import Ingest, recording_wish
 from stages.tune_weights import read_models
 
 MEMO = Path("datasets/memo/panel")
-PAGE = "page"  # of nightly.holdout.controller: the contestant that the page names
+PAGE = "page"  # value of nightly.holdout.controller: the controller that the page names
 
 
 class Judge(NamedTuple):
-    """`measure(folder, contestant)`: the evidence on a controller whose files lie below the folder (datasets,
-    or champion/<loop>); of the temperature loop, on the contestant of that name, or if it is empty on the one
-    that nightly.holdout.controller names. `allowed(champion)`: how much worse each guard may be."""
+    """`measure(folder, contestant)`: returns the evidence on a controller whose files lie below the folder
+    (datasets, or champion/<loop>). For the temperature loop, `contestant` names the controller; if it is
+    empty, nightly.holdout.controller does. `allowed(champion)`: returns how much worse each guard may be."""
 
     measure: Callable[..., CaseCosts]
     allowed: Callable[[CaseCosts], dict[str, float]]
@@ -55,8 +55,9 @@ def judge(loop: NightlyLoop, settings: Nightly) -> Judge:
 
 
 def _cases(path: Path) -> tuple[CaseCosts, dict[str, float]]:
-    """{"panel": name, "cases": {case: {"block": name, "cost": number}}, "guards":
-    {guard: {"value": number, "allowed": number}}}."""
+    """Reads a file of costs: {"panel": name, "cases": {case: {"block": name, "cost": number}}, "guards":
+    {guard: {"value": number, "allowed": number}}}. Returns the costs, and how much worse each guard may be.
+    Raises ValueError for other content."""
     declared = artifacts.read_json(path)
     try:
         cases = {
@@ -85,8 +86,8 @@ _EXPECTED = "expected panel, cases with block and cost, and guards with value an
 
 
 def _deposition(folder: Path) -> CaseCosts:
-    """Of each part program and material, none of which was trained on: the error of the flow that the chosen
-    composer leaves, as its stage scored it. Guard: the worst line, if one is judged."""
+    """Returns the flow error that the chosen composer leaves for each part program and material, as its stage
+    scored it; it was trained on none of them. Guard: the worst line, if one is judged."""
     table = artifacts.read_table(folder / "compose_parts/scores.parquet", SCORES)
     rows = [k for k, chosen in enumerate(table["chosen"]) if chosen]
     cases = {
@@ -96,15 +97,15 @@ def _deposition(folder: Path) -> CaseCosts:
         )
         for k in rows
     }
-    # missing where no line is long enough, or its forecast is not judged: that is no good line
+    # NaN if no line is long enough, or if its forecast is not valid; this does not mean a good line
     lines = [float(volume) for k in rows if np.isfinite(volume := table["worst_line_volume_percent"][k])]
     guards = {"worst_line_volume_percent": max(lines)} if lines else {}
     return CaseCosts(joblib.hash(sorted(cases)), cases, guards)
 
 
 def _setpoint(folder: Path) -> CaseCosts:
-    """Of each case of each simulator that counts: the share of runs that the chosen controller does not
-    settle, plus one point. Guards: the worst case, and the slowest."""
+    """Returns, for each case that counts, the percentage of runs that the chosen controller does not settle,
+    plus 1. Guards: the worst case, and the slowest."""
     table = artifacts.read_table(folder / "evaluate_setpoint/scoreboard.parquet", setpoint_tables.SCOREBOARD)
     chosen = artifacts.read_json(folder / "evaluate_setpoint/choice.json")
     rows = [k for k, name in enumerate(table["controller"]) if name == chosen["name"] and table["counts"][k]]
@@ -133,9 +134,9 @@ def _allowed(champion: CaseCosts, rule: PromotionRule) -> dict[str, float]:
 
 
 class FrozenPanel(NamedTuple):
-    """What every controller of the temperature loop is judged on, night after night: plants, starts,
-    references and noise, which are both halves of `rehearsal`, and the hold-out recordings; `name` is the
-    hash of all that they were made from."""
+    """The constant test set for every controller of the temperature loop: plants, starts, references and
+    noise (both halves of `rehearsal` are the same), and the hold-out recordings. `name`: hash of everything
+    that it was made from."""
 
     name: str
     machine: Machine
@@ -147,10 +148,10 @@ class FrozenPanel(NamedTuple):
 
 
 class NotComparable(ValueError):
-    """A controller that cannot be designed from its files, in one sentence."""
+    """Raised if a controller cannot be designed from its files; the message is one sentence."""
 
 
-# besides plant.parquet and window.parquet: what some contestants are designed from
+# artifacts that some controllers are designed from, besides plant.parquet and window.parquet
 DESIGNED_FROM = {
     "printer_pid": "ingest/printer_pid.json",
     "pi_simc": "identify_plant/spread.parquet",
@@ -161,15 +162,16 @@ DESIGNED_FROM = {
 
 
 def _temperature(settings: Nightly) -> Callable[..., CaseCosts]:
-    """Closed loop on every plant of the frozen panel, as deployed; prediction on the hold-out recordings."""
+    """Returns a function that simulates the closed loop on every plant of the frozen test set, as deployed,
+    and tests the prediction on the hold-out recordings."""
     frozen = frozen_panel(settings.holdout)
     own = settings.holdout.controller
     return lambda folder, contestant="": _closed_loop(frozen, folder, contestant or own, settings.rule)
 
 
 def frozen_panel(holdout: HoldOut) -> FrozenPanel:
-    """Plants drawn, with the seed of section `nightly.holdout`, around the true plant or around those of the
-    hold-out recordings, as far away as section `panel` says."""
+    """Draws plants, with the seed of section `nightly.holdout`, around the true plant or around those of the
+    hold-out recordings, with the spread of section `panel`."""
     machine, tracking = (
         recorded(params.load(Machine, "plant"), "datasets/ingest/record.parquet"),
         params.load(Tracking, "tracking"),
@@ -226,7 +228,7 @@ def _closed_loop(frozen: FrozenPanel, folder: Path, contestant: str, rule: Promo
         )
     }
     by_plant = [result.costs[asked.plant == p].mean() for p in np.unique(asked.plant)]
-    # as the page asks: stable on every plant, and the margin of the one that a tenth of them lie below
+    # as on the page: stable on every plant, and the margin that only a tenth of the plants lie below
     disk = float(np.quantile([margin.disk for margin in result.margins], 0.1, method="nearest"))
     guards = {
         "worst_case": float(np.max(by_plant)),
@@ -242,13 +244,13 @@ def _closed_loop(frozen: FrozenPanel, folder: Path, contestant: str, rule: Promo
 
 
 def judged(frozen: FrozenPanel, folder: Path, name: str) -> evaluation.ControllerOutcome:
-    """The contestant `name` whose files lie below `folder`, as it would be deployed: its own governor,
-    today's limits. Raises NotComparable where it cannot be designed from them."""
+    """Evaluates the controller `name` whose files lie below `folder`, as it would be deployed: with its own
+    governor and the present limits. Raises NotComparable if it cannot be designed from them."""
     try:
         design, setting = _designed(frozen, folder, name)
     except ValueError as reason:
         raise NotComparable(str(reason)) from None
-    # the gap to the optimum is for pages
+    # the gap to the optimum is only needed on pages
     return evaluation.evaluate(name, design._replace(plain=None), setting)[1]
 
 
@@ -273,7 +275,7 @@ def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[Design, pan
             f"{path}: expected the tuned parameters of {name}, {', '.join(values)}, found "
             f"{', '.join(tuned) or 'none'}; let tune_weights tune it"
         )
-    # what it was tuned for, not what it is judged by
+    # the conditions for which it was tuned, not those of the test
     problem = panel.design_problem(models, tracking, setting, None)._replace(
         horizon=int(tuned_for.get("horizon_steps", frozen.settings.steps)),
         noise=np.array(tuned_for.get("noise_degC", frozen.rehearsal.noise), float),
@@ -285,12 +287,13 @@ def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[Design, pan
 
 
 def identified(folder: Path) -> plant.Plant:
-    """The plant that was identified with a controller whose files lie below `folder`."""
+    """Returns the plant that was identified together with a controller whose files lie below `folder`."""
     return plant.restored(artifacts.read_arrays(folder / "identify_plant/plant.parquet", "plant", 1))[0]
 
 
 def _predictor(folder: Path, name: str, machine: Machine) -> plant.Plant:
-    """The model that a contestant predicts with: the window where it was learned from one."""
+    """Returns the model with which a controller predicts: the window model if it was learned from one, else
+    the identified plant."""
     if table.BY_NAME[name].learned_from not in ("window", "kernel", "trajectories"):
         return identified(folder)
     long = window.restored(artifacts.read_arrays(folder / "learn_kernel/window.parquet", "window", 1))
@@ -298,7 +301,8 @@ def _predictor(folder: Path, name: str, machine: Machine) -> plant.Plant:
 
 
 def _holdout_records(h: HoldOut, machine: Machine) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The hold-out recordings as gapless segments. Raises ValueError where there is none that can be read."""
+    """Returns the hold-out recordings as gapless segments. Raises ValueError if there is none that can be
+    read."""
     if not Path(h.recordings).is_dir():
         raise ValueError(
             f"{h.recordings}: expected recordings that nothing is trained on, found none; "
@@ -309,8 +313,8 @@ def _holdout_records(h: HoldOut, machine: Machine) -> list[tuple[np.ndarray, np.
 
 
 def measure_shares(settings: Nightly, paths: Sequence[str]) -> dict[str, dict[str, float]]:
-    """How much of each of these recordings of the temperature loop is learned from: samples with every
-    signal, in gapless stretches."""
+    """Returns how much of each of these recordings of the temperature loop is used for learning: samples with
+    every signal, in gapless stretches."""
     folders = [loop.recordings for loop in settings.loops.values() if loop.judge == "temperature"]
     own = [path for path in paths if folders and inputs.within(path, folders[0])]
     if not own or not _is_recorded():
@@ -339,9 +343,9 @@ def _is_recorded() -> bool:
 def read_records(
     folder: Path, machine: Machine, broken: dict[str, str] | None = None
 ) -> dict[str, RecordingTable]:
-    """{recording: what was read of it} below a folder, read as the stage `ingest` reads, through its memo;
-    reasons of those that cannot be read go to `broken`. Raises ValueError for the first of them if there is
-    none."""
+    """Returns {recording: its content} below a folder, read as by the stage `ingest`, through its cache.
+    Reasons of those that cannot be read are added to `broken`. If `broken` is None, raises ValueError for the
+    first of them."""
     settings = params.load(Ingest, "ingest")
     results = recording_folders.read_folder(
         folder,
@@ -361,8 +365,8 @@ def read_records(
 def segments(
     record: dict[str, np.ndarray], machine: Machine, *, masked: bool = True
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Inputs (T, m) and outputs (T, p) of each gapless stretch; NaN if an output was not measured, or is
-    masked, unless `masked` is false."""
+    """Returns inputs (T, m) and outputs (T, p) of each gapless stretch of at least 30 samples. An output is
+    NaN if it was not measured; also if it is masked, unless `masked` is false."""
     u, y = (
         np.stack(
             [np.where(record[f"{s.name}_masked"] & hide, np.nan, record[s.name]) for s in signals], axis=1
@@ -372,7 +376,7 @@ def segments(
     cuts = np.flatnonzero(np.diff(record["segment"])) + 1
     pairs = []
     for a, b in zip(np.split(u, cuts), np.split(y, cuts), strict=True):
-        # inputs without gaps: what lies between two is a segment of its own
+        # inputs without gaps: each stretch between two gaps is its own segment
         edges = np.flatnonzero(np.diff(np.concatenate([[0], np.isfinite(a).all(axis=1).astype(int), [0]])))
         pairs += [(a[i:j], b[i:j]) for i, j in zip(edges[::2], edges[1::2], strict=True) if j - i >= 30]
     return pairs
@@ -381,8 +385,8 @@ def segments(
 def _panel_plants(
     folder: Path, records: list[tuple[np.ndarray, np.ndarray]], machine: Machine
 ) -> list[plant.Plant]:
-    """The plants of the hold-out recordings: identified from them alone by the method of the stage
-    `identify_plant`, and its spread around; kept, since neither changes from night to night."""
+    """Returns the plants of the hold-out recordings. They are identified from these alone by the method of
+    the stage `identify_plant`, with their spread, and cached, since neither changes from night to night."""
     settings = params.load(IdentifyPlant, "identify_plant")
     path = MEMO / f"{joblib.hash((records, settings.model_dump(), machine.model_dump()))}.parquet"
     if not path.exists():
@@ -402,7 +406,8 @@ def _panel_plants(
 
 
 def _prediction_error(model, records: list[tuple[np.ndarray, np.ndarray]]) -> float | None:
-    """Root mean square one-step error in °C on the hold-out recordings, None where there are none."""
+    """Returns the root mean square one-step error in °C on the hold-out recordings; None if there are
+    none."""
     if not records:
         return None
     from pipeline.temperature.identification import validation

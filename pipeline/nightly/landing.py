@@ -1,6 +1,6 @@
-"""How a night lands: one commit of what it made in its copy, one tag a loop that it promoted, all references
-in one step; then the project is brought to the commit, production last. A note in .beadline says what is on
-its way, so that the next night, or a rollback, finishes what was killed in between."""
+"""Puts a run's results into the project: one commit of what it made in its copy, one tag for each promoted
+loop, all references moved in one step. Then the project's files follow, production last. A note in .beadline
+records a landing in progress, so that the next run, or a rollback, can finish it if it was killed."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,14 +15,14 @@ from pipeline.nightly.worktree import COPY, Snapshot
 from pipeline.store import artifacts
 
 NOTE = STATE / "landing.json"
-# on the disk before the night says so: git's default leaves loose objects in memory
+# written to the disk before the run reports it: git's default leaves loose objects in memory
 DURABLE = {"core.fsync": "all"}
 
 
 class Landing(NamedTuple):
-    """A commit on its way into the project: the branch, and what it was before; the project's files when the
-    night began; tags by name; recordings that are set aside, {path: (loop, reason, digest)}; lists of those
-    that stay, {path: text}."""
+    """A commit on its way into the project. `branch`, and `before`, its previous commit; `files`: the
+    project's files when the run began; `tags` by name; `quarantined`: recordings that are set aside, {path:
+    (loop, reason, digest)}; `lists` of excluded recordings that are not moved, {path: text}."""
 
     commit: str
     branch: str
@@ -34,8 +34,8 @@ class Landing(NamedTuple):
 
 
 def get_branch() -> str:
-    """The reference of the branch that is checked out. Raises ValueError if there is none: what is committed
-    there is lost with the next checkout."""
+    """Returns the reference of the branch that is checked out. Raises ValueError if there is none, because a
+    commit would be lost with the next checkout."""
     branch = git("symbolic-ref", "-q", "HEAD", check=False)
     if not branch:
         raise ValueError(
@@ -46,8 +46,8 @@ def get_branch() -> str:
 
 
 def check_head(snapshot: Snapshot, places: Sequence[str]) -> str:
-    """The present commit of HEAD. Raises ValueError if one since the snapshot holds something below
-    `places`, which the night is made from or writes, or if another branch is checked out."""
+    """Returns the present commit of HEAD. Raises ValueError if a commit since the snapshot changes something
+    below `places`, which the run reads or writes, or if another branch is checked out."""
     head, branch = git("rev-parse", "HEAD"), git("symbolic-ref", "-q", "HEAD", check=False)
     if branch != snapshot.branch:
         raise ValueError(
@@ -64,8 +64,8 @@ def check_head(snapshot: Snapshot, places: Sequence[str]) -> str:
 
 
 def commit(paths: Sequence[str], message: str, parents: Sequence[str]) -> str:
-    """A commit of these paths as they lie in the copy over the tree of the first parent; empty if nothing
-    differs. No reference and no index of anybody's changes."""
+    """Commits these paths as they are in the copy, on the tree of the first parent. Returns the commit; "" if
+    nothing differs. Moves no reference, and does not touch the user's index."""
     index = STATE / "index"
     Path(f"{index}.lock").unlink(missing_ok=True)  # of a git that was killed with its night
     env = {"GIT_INDEX_FILE": str(index.resolve())} | configure(DURABLE)
@@ -93,28 +93,28 @@ def commit(paths: Sequence[str], message: str, parents: Sequence[str]) -> str:
 
 
 def _is_linked(root: Path, name: str) -> bool:
-    """Whether a path is a link below `root`, or lies behind one."""
+    """Returns whether a path below `root` is a link, or lies behind one."""
     return any((root / path).is_symlink() for path in (name, *Path(name).parents))
 
 
 def move(references: Mapping[str, tuple[str, str]], message: str) -> None:
-    """Moves references {name: (new, old)}, all or none; an old one of "" is not asked. Raises ValueError if
-    one has moved meanwhile."""
+    """Moves references {name: (new, old)}, all or none; an old value of "" is not checked. Raises ValueError
+    if one has moved meanwhile."""
     lines = [f"update {name} {new} {old}".rstrip() for name, (new, old) in references.items()]
     text = "\n".join(["start", *lines, "prepare", "commit", ""])
     git("update-ref", "-m", message, "--stdin", text=text, env=configure(DURABLE))
 
 
 def land(landing: Landing, message: str) -> None:
-    """Moves the branch and the tags to the commit; `finish` brings the project to it."""
+    """Moves the branch and the tags to the commit; `finish` then brings the project's files to it."""
     artifacts.write_json(NOTE, to_json(landing))
     tags = {name: (commit, "") for name, commit in landing.tags.items()}
     move({landing.branch: (landing.commit, landing.before)} | tags, message)
 
 
 def finish() -> list[str]:
-    """Brings the project to a commit that a night made, as far as somebody has not edited the same files
-    since; forgets one that its branch never came to. What was done, as sentences."""
+    """Brings the project's files to a commit of a run, except files edited since. If the branch never reached
+    that commit, drops it. Returns what was done, as sentences."""
     if not NOTE.exists():
         return []
     landing = from_json(Landing, artifacts.read_json(NOTE))
@@ -144,11 +144,11 @@ def _bring_files(landing: Landing) -> list[str]:
     paths = differ(landing.before, landing.commit)
     deleted = differ("--diff-filter=D", landing.before, landing.commit)
     staged = differ("--cached", landing.before)
-    # no reference holds that commit: a clean-up of git may have taken it
+    # no reference points to that commit, so git's clean-up may have removed it
     files = git("rev-parse", "-q", "--verify", f"{landing.files}^{{commit}}", check=False) or landing.before
     edited = differ(files)
     tracked = {*names("ls-tree", "-r", "--name-only", files)}
-    # what git did not know when the night began, a new recording, lies there already
+    # a file that git did not know when the run began, such as a new recording, is already there
     bring = [name for name in paths if name not in edited and (name in tracked or not Path(name).exists())]
     for name in {*bring} & {*deleted}:
         Path(name).unlink(missing_ok=True)
@@ -161,7 +161,7 @@ def _bring_files(landing: Landing) -> list[str]:
 
 
 def _changed_stages(landing: Landing) -> list[str]:
-    """The stages that ran: DVC's cache has their outs."""
+    """Returns the stages that ran; DVC's cache has their outputs."""
     before, after = (
         (yaml.safe_load(git("show", f"{commit}:dvc.lock", check=False) or "{}") or {}).get("stages", {})
         for commit in (landing.before, landing.commit)
@@ -175,7 +175,8 @@ def _call_with_paths(*command: str, paths: Sequence[str], **how: Any) -> None:
 
 
 def set_aside(quarantined: Mapping[str, tuple[str, str, str]], lists: Mapping[str, str]) -> None:
-    """Sets the project's recordings aside, each if it is still what was judged, and lists those that stay."""
+    """Sets the project's recordings aside, each only if it is still the file that was judged, and writes the
+    lists of those that are not moved."""
     for path, text in lists.items():
         if not Path(path).exists() or Path(path).read_text(encoding="utf-8") != text:
             artifacts.write_text(path, text)

@@ -1,10 +1,10 @@
-"""Mistakes of recording: a record that is not what it says it is.
+"""Recording mistakes: a record whose signals are not what they are labelled as.
 
-Swapped sensors or inputs, °F or K for °C, a factor of ten, a clock that is shifted between inputs and
-outputs. One is believed if undoing it explains the record BETTER times as well as taking it at its word, what
-is left is no more than on an honest record, and no change of the machine explains as much: a drifted machine
-must never be silenced as a badly written record. If the machine would have had to change as none can, the
-likeliest mistake is named all the same.
+Examples are swapped sensors or inputs, °F or K instead of °C, a factor of ten, or a clock shift between
+inputs and outputs. A mistake is accepted if undoing it makes the record fit BETTER times as well, if the
+remaining error is no more than on an honest record, and if no change of the machine explains as much. A
+drifted machine must never be dismissed as a badly written record. If the machine would have had to change
+impossibly, the likeliest mistake is still named.
 """
 
 import itertools
@@ -18,14 +18,15 @@ from pipeline.nightly.baseline import Baseline
 from pipeline.nightly.drift import ProductionModel, Segments
 
 BETTER = 30.0  # by which the mean squared error must fall
-HONEST = 2.0  # of the largest of the champion's own records: what an honest one may leave
-AS_MUCH = 2.0  # a change of the machine that leaves up to so much more explains as much
+HONEST = 2.0  # times the largest error of the champion's own records that an honest record may leave
+AS_MUCH = 2.0  # a change of the machine that leaves up to this many times the error explains as much
 ROOM = drift.RESTLESS._replace(another_season=False)  # the air is not 48 °C warmer: that is °F
-# what is left with two mistakes undone that a record does not tell apart: one sensor, or every one
+# ratio of the remaining errors up to which a record cannot distinguish two mistakes, such as one sensor or
+# every one
 ALIKE = 2.0
-# samples by which a clock is looked for, before those between
+# clock shifts in samples that are tried first, before those between them
 CLOCKS = [late for far in (2, *range(4, 129, 4)) for late in (far, -far)]
-# what is written, and the factor and the offset that undo it
+# what was written, and the factor and the offset that undo it
 OF_SENSORS = (
     ("in °F where °C is declared", 1 / 1.8, -32 / 1.8),
     ("in K where °C is declared", 1.0, -273.15),
@@ -40,8 +41,8 @@ OF_INPUTS = (
 
 
 class Mistake(NamedTuple):
-    """What is wrong with a record in words, the record with that undone, the mean squared error that it then
-    leaves, and how many times that was larger."""
+    """`words`: what is wrong with a record; `undone`: the record without the mistake; `left`: its mean
+    squared error then; `better`: by what factor the error was larger."""
 
     words: str
     undone: Segments
@@ -50,7 +51,7 @@ class Mistake(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """Why the record is set aside, in one sentence."""
+        """Returns why the record is set aside, in one sentence."""
         return (
             f"{self.words}: undone, the record fits the champion's model {self.better:.0f} times better; "
             "mend it and put it back"
@@ -65,8 +66,8 @@ def found(
     inputs: Sequence[str],
     outputs: Sequence[str],
 ) -> Mistake | None:
-    """The mistake that was made in writing a record; None if it is what it says, or if a change of the
-    machine explains it as well. Raises ValueError if the record is too short."""
+    """Returns the recording mistake of a record; None if it has none, or if a change of the machine explains
+    it as well. Raises ValueError if the record is too short."""
     asked = drift.record(machine, segments, own.scale, ROOM)
     as_is = baseline.misfit(asked, own.changes)
     if as_is < BETTER:
@@ -75,13 +76,13 @@ def found(
     if mistake.left > honest(own) or mistake.better < BETTER:
         return None
     samples = sum(int(one.measured.sum()) for one in asked.segments)
-    every_delay = drift.DriftCause("delay", -1)  # which is a shifted clock by another name
+    every_delay = drift.DriftCause("delay", -1)  # this is the same as a shifted clock
     explained = [fit.explained for fit in drift.alone(asked, own.changes) if fit.cause != every_delay]
     return None if as_is - max(explained) / samples < AS_MUCH * mistake.left else mistake
 
 
 def honest(own: Baseline) -> float:
-    """The mean squared error that an honest record may leave, in that of the champion's own."""
+    """Returns the largest mean squared error of an honest record, in units of that of the champion's own."""
     return HONEST * float(max(own.misfit.max(), 1.0))
 
 
@@ -93,11 +94,12 @@ def likeliest(
     inputs: Sequence[str],
     outputs: Sequence[str],
 ) -> Mistake:
-    """Of all mistakes the one that explains the record best with it undone, be that well or not; mistakes
-    that explain as much are named with it. Raises ValueError if the record is too short.
+    """Returns the mistake that, if undone, explains the record best, whether that is good enough or not.
+    Mistakes that explain as much are named with it. Raises ValueError if the record is too short.
 
-    Sensors that are scaled down err less for that alone: what is compared is the likelihood of the record as
-    it was written, |e|^2 / samples - 2 log scale, which takes the density of what was undone to its units.
+    Sensors that are scaled down err less for that reason alone. So the likelihood of the record as written is
+    compared,
+    e|^2 / samples - 2 log scale, which converts the density of the undone record to the written units.
     """
 
     def left(undone: Segments) -> float:
@@ -135,8 +137,9 @@ def likeliest(
 def _list_written(
     inputs: Sequence[str], outputs: Sequence[str]
 ) -> Iterator[tuple[str, int, np.ndarray, np.ndarray, np.ndarray]]:
-    """Signals that are swapped, and wrong units and factors of every one and of each: in words, whether of
-    inputs (0) or outputs (1), and what undoes it: the order of the columns, their factors and offsets."""
+    """Yields swapped signals, and wrong units and factors of all signals and of each. Each mistake is given
+    in words, with its side, inputs (0) or outputs (1), and what undoes it: the order of the columns, their
+    factors and offsets."""
     for side, noun, names, kinds in ((1, "sensor", outputs, OF_SENSORS), (0, "input", inputs, OF_INPUTS)):
         order, every = np.arange(len(names)), np.ones(len(names))
         for i, j in itertools.combinations(order, 2):
@@ -149,7 +152,7 @@ def _list_written(
 
 
 def _move(segments: Segments, late: int) -> Segments:
-    """The outputs brought forward by so many samples; what has no partner is left out."""
+    """Moves the outputs forward by `late` samples; samples without a partner are left out."""
     if late > 0:
         return [(u[:-late], y[late:]) for u, y in segments if len(y) > late]
     return [(u[-late:], y[:late]) for u, y in segments if len(y) > -late]

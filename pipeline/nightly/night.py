@@ -1,7 +1,7 @@
-"""One night: recordings in, `dvc repro`, judge, promote or keep, say so.
+"""One nightly run: takes new recordings, runs `dvc repro`, judges, promotes or keeps, and reports.
 
-Exit status 0: promoted, kept, or nothing new; 1: the night failed; 3: drift alarm; 4: recordings were set
-aside; 75: another night is at work.
+Exit status 0: promoted, kept, or nothing new; 1: the run failed; 3: drift alarm; 4: recordings were set
+aside; 75: another run is in progress.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ from pipeline.nightly.settings import Nightly, NightlyLoop
 from pipeline.nightly.worktree import COPY, Snapshot
 from pipeline.store import artifacts, params
 
-# the loop whose recordings are learned from if this parameter says so
+# loop -> the parameter that decides whether its recordings are used for learning
 RECORDED = "recordings"
 SOURCES = {
     "temperature": "generate_probing.source",
@@ -44,21 +44,21 @@ CUT_PERCENT = 5.0  # of a recording; more is a note
 
 
 def nightly(render: reporting.Render, now: datetime.datetime | None = None) -> tuple[int, str]:
-    """Exit status and the one-line summary of a night; `render` makes its page. Somebody learns of the night,
-    whatever happens."""
+    """Returns exit status and one-line summary of a nightly run; `render` makes its page. Whatever happens,
+    the run is reported."""
     started = now or datetime.datetime.now(datetime.UTC)
     try:
         with worktree.locked():
             return _run(started, render)
     except worktree.BusyError as busy:
         return reporting.BUSY, f"nightly: refused: {busy}"
-    except Exception as error:  # nothing may end a night without a word
+    except Exception as error:  # no run may end without a report
         return reporting.last_resort(error, started)
 
 
 def preview() -> str:
-    """What a run would do now, in a sentence: whether it has anything to learn from, and which recordings are
-    new. Changes nothing. Raises ValueError if a run would be refused."""
+    """Returns, in a sentence, what a run would do now: whether there is anything to learn from, and which
+    recordings are new. Changes nothing. Raises ValueError if a run would be refused."""
     last = remembered.read()
     night = Night(last.night + 1, f"night-{last.night + 1:04d}", "")
     settings = _leave_out_loops(params.load(Nightly, "nightly"), copy.copy(last), night)
@@ -84,29 +84,29 @@ def _run(now: datetime.datetime, render: reporting.Render) -> tuple[int, str]:
     try:
         try:
             settings = params.load(Nightly, "nightly")
-        finally:  # what a killed night left is put right whatever the parameters are
+        finally:  # repairs what a killed run left, whatever the parameters are
             night.notes += [*worktree.clear_killed(), *landing.finish(), *champion.follow()]
         _work(settings, last, memory, night)
-    except Exception as error:  # refused in a sentence, or a mistake of this program
+    except Exception as error:  # a refusal in a sentence, or an error of this program
         night.notes += _fail(night, reporting.tell(error, night.run))
-    worktree.remove()  # on a full disk, what follows needs the room
+    worktree.remove()  # on a full disk, the following steps need the space
     night.seconds = round(time.monotonic() - clock, 1)
     if last.success and settings and (overdue := watch.find_overdue(now, last.success, settings.watch_h)):
         night.notes.append(f"watch: {overdue}")
     if night.outcome == records.FAILED:
-        # a recording of a failed night is new again the next one, and must not count as two
+        # a recording of a failed run is new again in the next one, and must not count twice
         last.hashes, memory = memory.hashes, last
     else:
         memory.unpushed, memory.idle = night.unpushed, night.idle
-        # a night that lost a loop is repeated
+        # a run that lost a loop is repeated
         memory.inputs, memory.success = ("", last.success) if night.lost else (memory.inputs, night.when)
     memory.night = number
     return reporting.report(night, memory, settings, render)
 
 
 def _fail(night: Night, why: str) -> list[str]:
-    """A night that has made its commit stays what it was, and the next one finishes it. What is left to
-    say."""
+    """Records a failure, and returns the notes to add. A run that has already made its commit keeps it, and
+    the next one finishes it."""
     if night.commit:
         night.unpushed = True
         return [why]
@@ -116,8 +116,8 @@ def _fail(night: Night, why: str) -> list[str]:
 
 
 def _work(settings: Nightly, last: Memory, memory: Memory, night: Night) -> None:
-    """The work of a night, which `night` tells and `memory` remembers. What it raises ends the night, which
-    keeps what it came to until then."""
+    """Does the work of a run; results go to `night` and `memory`. An exception ends the run, which keeps its
+    results so far."""
     settings = _leave_out_loops(settings, memory, night)
     if not settings.loops:
         night.end(records.NOTHING_NEW, "section loops switches off every loop")
@@ -145,7 +145,7 @@ def _work(settings: Nightly, last: Memory, memory: Memory, night: Night) -> None
         digests = inputs.contents(places, memory.hashes)
     recordings = {name: inputs.recordings(digests, loop) for name, loop in settings.loops.items()}
     memory.recordings, memory.inputs = last.recordings | recordings, inputs.digest(digests)
-    # what was set aside in the copy is to be moved out of the project too
+    # recordings that were set aside in the copy must be moved out of the project, too
     moved = [path for path in night.drift.quarantined if Path(path).exists() and not (COPY / path).exists()]
     aside = {path: artifacts.sha256(path) for path in moved}
     if is_known():
@@ -174,13 +174,13 @@ def _work(settings: Nightly, last: Memory, memory: Memory, night: Night) -> None
 
 
 def _list_places(settings: Nightly) -> list[str]:
-    """What a night reads."""
+    """Returns the files and folders that a run reads."""
     folders = [loop.recordings for loop in settings.loops.values() if loop.recordings]
     return [*inputs.sources(), settings.holdout.recordings, *folders]
 
 
 def _leave_out_loops(settings: Nightly, memory: Memory, night: Night) -> Nightly:
-    """The settings without the loops that section `loops` switches off. Checks every section of the
+    """Returns the settings without the loops that section `loops` switches off. Checks every section of the
     parameters."""
     switches = stages.check_parameters()
     loops = {name: loop for name, loop in settings.loops.items() if switches.get(name, True)}
@@ -191,7 +191,8 @@ def _leave_out_loops(settings: Nightly, memory: Memory, night: Night) -> Nightly
 
 
 def _check(settings: Nightly) -> None:
-    """Raises ValueError if the night cannot end well."""
+    """Raises ValueError if the run cannot succeed: too little disk space, broken stage files, or a wrong
+    branch."""
     free = shutil.disk_usage(Path()).free / 1e6
     if free < settings.least_free_mb:
         raise ValueError(
@@ -217,8 +218,8 @@ def _note_idle(night: Night, nights: int) -> None:
 
 
 def _find_new(settings: Nightly, last: Memory, digests: Mapping[str, str], night: Night) -> None:
-    """The recordings of each loop whose content was not there the night before, or how long there was
-    none."""
+    """Finds the recordings of each loop that are new since the last run; if there are none, notes for how
+    many runs."""
     for name, loop in settings.loops.items():
         known = last.recordings.get(name, {}).values()
         recordings = inputs.recordings(digests, loop).items()
@@ -230,7 +231,7 @@ def _find_new(settings: Nightly, last: Memory, digests: Mapping[str, str], night
 
 
 def _tell_unused(loop: NightlyLoop, recordings: Sequence[str]) -> list[str]:
-    """That new recordings of a loop are not learned from, and what would change that."""
+    """Returns a note if new recordings of a loop are not used for learning, and how to change that."""
     dotted = SOURCES.get(loop.judge, "")
     section, _, key = dotted.partition(".")
     source = params.read().get(section, {}).get(key, RECORDED)
@@ -244,12 +245,13 @@ def _tell_unused(loop: NightlyLoop, recordings: Sequence[str]) -> list[str]:
 
 
 def _name_few(paths: Sequence[str]) -> str:
-    """ "a, b, c and 2 more"."""
+    """Returns "a, b, c and 2 more"."""
     return ", ".join(paths[:3]) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
 
 
 def _screen(settings: Nightly, state: ChampionState, memory: Memory, night: Night) -> None:
-    """New recordings held against the champions; what cannot be learned from is out of the copy then."""
+    """Compares new recordings with the champions'. Recordings that cannot be learned from are removed from
+    the copy."""
     from pipeline.nightly import judge, screening  # they take seconds to import
 
     night.drift = screening.look(settings, state.champions, night.new_recordings, memory)
@@ -269,10 +271,10 @@ def _screen(settings: Nightly, state: ChampionState, memory: Memory, night: Nigh
 def _learn(
     settings: Nightly, state: ChampionState, night: Night, lineage: Mapping[str, Any]
 ) -> ChampionState:
-    """Runs the stages in the copy, and judges what they made."""
+    """Runs the stages in the copy, and judges the results."""
     from pipeline.nightly import promoting
 
-    # the pages of tonight show tonight's drift, and judge by it
+    # the pages of this run show its drift, and use it in their verdicts
     artifacts.write_json(METRICS, night.metrics(state))
     for loop in settings.loops.values():
         # large recordings are DVC's: the pointer beside the folder moves with it
@@ -305,9 +307,9 @@ def _land(
     places: Sequence[str],
     aside: Mapping[str, str],
 ) -> None:
-    """The night's commit, and the project brought to it; or the commit on a branch on which promotions wait.
-    A night that changed nothing but its own figures makes none. `aside` is {path: digest} of the recordings
-    that are to be moved out of the project."""
+    """Makes the run's commit and brings the project to it, or puts the commit on the branch of waiting
+    promotions. Makes no commit if only the run's own figures changed. `aside`: {path: digest} of recordings
+    to move out of the project."""
     by_branch, promoted = settings.promotion == "branch", night.promoted
     tracked = ["dvc.lock", "reports/metrics", "datasets/.gitignore", *inputs.recorded_places(settings)]
     night.branch = settings.branch if by_branch and promoted else ""
@@ -348,8 +350,8 @@ def _land(
 
 
 def _find_tips(settings: Nightly) -> dict[str, str]:
-    """{reference: commit} of the branch on which promotions wait, here and on the remotes of git: it only
-    moves forward."""
+    """Returns {reference: commit} of the branch of waiting promotions, here and on git's remotes. This branch
+    only moves forward."""
     references = [f"refs/remotes/{remote}/{settings.branch}" for remote in git("remote").split()]
     references.append(f"refs/heads/{settings.branch}")
     tips = {name: git("rev-parse", "-q", "--verify", name, check=False) for name in references}
@@ -357,7 +359,7 @@ def _find_tips(settings: Nightly) -> dict[str, str]:
 
 
 def _push(settings: Nightly, night: Night) -> None:
-    """The artifacts to DVC's remote, and a branch on which promotions wait to git's."""
+    """Pushes the artifacts to DVC's remote, and a branch of waiting promotions to git's."""
     try:
         if settings.remote:
             with contextlib.chdir(COPY):

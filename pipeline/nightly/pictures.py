@@ -1,5 +1,5 @@
-"""The cameras' part of a night: pictures of new recordings held against those that the champion was made of;
-and what of all that has changed is an alarm."""
+"""The cameras' part of a nightly run: compares pictures of new recordings with those of the champion, and
+decides which changes are alarms."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -26,8 +26,8 @@ FRAMES = 40  # pictures of a recording that are looked at
 
 
 def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[Any]]:
-    """[median, deviation] of each of the last `most` trials below `folder` whose pictures show a bead; `only`
-    those named if any are."""
+    """Returns [median, deviation] for each of the last `most` trials below `folder` whose pictures show a
+    bead; only of those named in `only`, if any are."""
     rows, camera = [], _camera()
     trials = readable(sorted(folder.rglob("*.mcap")), folder)
     paths = [path for path in trials if not only or path.as_posix() in only]
@@ -41,7 +41,8 @@ def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
 
 
 def _camera() -> "Camera":
-    """Section `camera`, through whose topics a trial is read, however many of its frames can be."""
+    """Returns section `camera`, whose topics a trial is read with; any number of unreadable frames is
+    accepted."""
     from pipeline.deposition.settings import Camera
 
     return params.load(Camera, "camera").model_copy(update={"unreadable_share": 1.0})
@@ -63,8 +64,8 @@ def find_trials_drift(
     reference: Sequence[Sequence[Any]],
     pending: Collection[str],
 ) -> None:
-    """Adds what new trials say: those that cannot be read are set aside, the others' pictures held against
-    those of `reference`."""
+    """Compares the pictures of new trials with those of `reference`, and adds the results. Trials that cannot
+    be read are set aside."""
     camera = _camera()
     before = [(np.array(row[0]), np.array(row[1])) for row in reference]
     for path in (path for path in paths if path.lower().endswith(".mcap")):
@@ -92,10 +93,10 @@ def find_trials_drift(
 
 
 class NightPrint(NamedTuple):
-    """Of a print's frames, as reference.json keeps them: name; those of each class and without a line (4,);
-    frames of a segment; the line's median contrast and its deviation, nothing if no frame shows a line; those
-    that look like what the champion's classifier learned from, and those that do not (2,), 0 if that is not
-    known."""
+    """A print's frames, as reference.json stores them: `name`; `counts` (4,), frames of each class and
+    without a line; `together`, frames of a segment; `contrast` and `deviation`, the line's median contrast
+    and its standard deviation, empty if no frame shows a line; `familiar` (2,), frames that look like those
+    the champion's classifier learned from, and frames that do not, 0 if unknown."""
 
     name: str
     counts: list[int]
@@ -106,8 +107,8 @@ class NightPrint(NamedTuple):
 
 
 def of_prints(folder: Path, champion: Path, most: int, only: Sequence[str] = ()) -> list[NightPrint]:
-    """The last `most` prints below `folder`, `only` those named if any are, as the classifier below
-    `champion` sees them."""
+    """Returns the last `most` prints below `folder`, or only those named in `only` if any are, as the
+    classifier below `champion` sees them."""
     from pipeline.setpoint.recordings import read_options
     from pipeline.setpoint.settings import SetpointMaterial
 
@@ -123,7 +124,7 @@ def of_prints(folder: Path, champion: Path, most: int, only: Sequence[str] = ())
     for number, name in numbered[-most:]:
         here = frames.print_number == number
         seen = here & frames.valid & (frames.label >= 0)
-        if not seen.any() and (here & frames.valid).any():  # its flow is not known
+        if not seen.any() and (here & frames.valid).any():  # the print's flow is unknown
             continue
         classes = np.bincount(frames.label[seen], minlength=3).tolist()
         together = float(here.sum() / len(np.unique(frames.segment[here])))
@@ -144,8 +145,8 @@ def of_prints(folder: Path, champion: Path, most: int, only: Sequence[str] = ())
 
 
 def _foreignness(frames: nozzle_frames.NozzleFrames, champion: Path) -> tuple[np.ndarray, float]:
-    """How far each frame (n,) is from what the champion's classifier learned from, NaN if that is not known,
-    and beyond what it is foreign."""
+    """Returns the distance of each frame (n,) from what the champion's classifier learned from, NaN if
+    unknown, and the distance above which a frame is foreign."""
     files = [champion / f"train_classifier/{name}" for name in ("weights.safetensors", "calibration.parquet")]
     if not all(file.exists() for file in files):
         return np.full(len(frames.valid), np.nan), np.inf
@@ -157,7 +158,7 @@ def _foreignness(frames: nozzle_frames.NozzleFrames, champion: Path) -> tuple[np
 
 
 def _classifier() -> "TrainClassifier | None":
-    """Section `train_classifier` if it learns from recordings."""
+    """Returns section `train_classifier` if it learns from recordings, else None."""
     from pipeline.setpoint.settings import TrainClassifier
 
     settings = params.load(TrainClassifier, "train_classifier")
@@ -174,9 +175,9 @@ def find_prints_drift(
     reference: Sequence[Sequence[Any]],
     pending: Collection[str],
 ) -> None:
-    """Adds what the new prints `paths` in the loop's folder of recordings say. A file that cannot be read is
-    set aside. Classes, frames without a line, those that are foreign to the classifier below `champion`, and
-    the line's contrast are compared with the prints of `reference`."""
+    """Compares the new prints `paths` in the loop's folder of recordings with the prints of `reference`, and
+    adds the results: classes, frames without a line, frames foreign to the classifier below `champion`, and
+    the line's contrast. A file that cannot be read is set aside."""
     if not (settings := _classifier()):
         return
     for path in paths:
@@ -188,7 +189,7 @@ def find_prints_drift(
     names = {one.name for one in before}
     try:
         prints = [one for one in of_prints(Path(folder), champion, 10**6) if one.name not in names]
-    except ValueError as error:  # what the stage will refuse as well, and say so
+    except ValueError as error:  # the stage will refuse this as well, and report it
         drift.notes.append(str(error))
         return
     for one in prints:
@@ -198,7 +199,7 @@ def find_prints_drift(
 def _print_changes(
     one: NightPrint, before: Sequence[NightPrint], limits: DriftLimits
 ) -> list[camera_drift.CameraChange]:
-    """What a print's frames say against those of the prints before."""
+    """Returns the changes of a print's frames, compared with the prints before."""
     points, usual = limits.balance_points, np.array([other.counts for other in before])
     causes = camera_drift.balance_changes(np.array(one.counts), usual, together=one.together, points=points)
     known = np.array([other.familiar for other in before if sum(other.familiar)])
@@ -213,7 +214,7 @@ def _print_changes(
 
 
 def _unreadable(path: str, settings: "TrainClassifier") -> str:
-    """Why a print's file cannot be read; empty if it can."""
+    """Returns why a print's file cannot be read; "" if it can."""
     from pipeline.setpoint.recordings import read_options
 
     try:
@@ -237,8 +238,9 @@ def add_alarms(
     causes: Sequence[camera_drift.CameraChange],
     pending: Collection[str],
 ) -> None:
-    """Adds the causes that a recording shows. A cause is an alarm if it is sure at once, or has been watched
-    the night before (`pending`); it is watched if it is nearly sure."""
+    """Adds the causes that a recording shows. A cause is an alarm if it is certain at once, or if it is
+    nearly certain and was watched in the run before (`pending`). A cause that is only nearly certain is
+    watched."""
     for key, words, sigmas in causes:
         alarm = Alarm(loop, f"{loop}: {key}", path, words, round(float(sigmas), 1))
         nearly_sure = abs(sigmas) >= limits.watch_sigmas

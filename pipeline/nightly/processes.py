@@ -1,4 +1,4 @@
-"""git and dvc as they are, run as children of the night."""
+"""Runs git and dvc as child processes of a nightly run."""
 
 import json
 import os
@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 STATE = Path(".beadline")
-# DVC for the night whose number its first argument is. If the night is killed, the kernel says so, if it can
-# (PR_SET_PDEATHSIG of prctl), and DVC ends with its stages, which are of its process group. The stages do not
-# hear of it themselves
+# runs DVC for the nightly run whose process id is its first argument. If that run is killed, the kernel
+# signals it, if it can (PR_SET_PDEATHSIG of prctl), and DVC ends together with its stages, which are in its
+# process group. The stages themselves get no such signal
 DVC = """
 import ctypes, os, runpy, signal, sys
 signal.signal(signal.SIGTERM, lambda *_: os.killpg(0, signal.SIGKILL))
@@ -28,21 +28,21 @@ FALLBACK = {"GIT_AUTHOR_NAME": "beadline nightly", "GIT_AUTHOR_EMAIL": "nightly@
 
 
 class TooLongError(ValueError):
-    """What was run took longer than it may, and was ended."""
+    """A command took longer than allowed, and was ended."""
 
 
 def git(
     *arguments: str, env: Mapping[str, str] | None = None, check: bool = True, place: Path | str = "", text=""
 ) -> str:
-    """Standard output of `git ...`, in the worktree `place` if it is named; `text` is its input. Raises
-    ValueError with git's own reason if it fails and `check` is on."""
+    """Returns the standard output of `git ...`, in the worktree `place` if given; `text` is its input. Raises
+    ValueError with git's own reason if it fails and `check` is true."""
     ended = subprocess.run(
         ["git", *(("-C", str(place)) if place else ()), *arguments],
         check=False,
         capture_output=True,
         encoding="utf-8",
-        errors="surrogateescape",  # as Python names files whose names are no text
-        # a recording may be called [1].csv, which git would take for a pattern
+        errors="surrogateescape",  # as Python represents file names that are no text
+        # a recording may be called [1].csv, which git would read as a pattern
         env={**os.environ, "GIT_LITERAL_PATHSPECS": "1", **(env or {})},
         input=text,
     )
@@ -58,12 +58,14 @@ def git(
 def names(
     command: str, *rest: str, env: Mapping[str, str] | None = None, place: Path | str = ""
 ) -> list[str]:
-    """The paths that `git ... -z` prints, whatever characters they have. Raises ValueError if it fails."""
+    """Returns the paths that `git ... -z` prints, whatever characters they have. Raises ValueError if it
+    fails."""
     return [name for name in git(command, "-z", *rest, env=env, place=place).split("\0") if name]
 
 
 def configure(settings: Mapping[str, str]) -> dict[str, str]:
-    """The environment in which git goes by these settings, beside those that the environment has already."""
+    """Returns the environment in which git uses these settings, in addition to those already in the
+    environment."""
     before = int(os.environ.get("GIT_CONFIG_COUNT", "0") or 0)
     env = {"GIT_CONFIG_COUNT": str(before + len(settings))}
     for number, (key, value) in enumerate(settings.items(), start=before):
@@ -72,15 +74,15 @@ def configure(settings: Mapping[str, str]) -> dict[str, str]:
 
 
 def identity() -> dict[str, str]:
-    """The user's name in git, or the job's own if none is set, as on a build machine."""
+    """Returns the user's name in git, or the job's own if none is set, as on a build machine."""
     author = {} if git("config", "user.email", check=False) else FALLBACK
     return author | {key.replace("AUTHOR", "COMMITTER"): value for key, value in author.items()}
 
 
 def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> None:
-    """Runs `dvc ...` by this Python on the code of this folder; `log` is what it prints. Raises ValueError
-    with its own sentence if it fails, and TooLongError if it takes longer than `limit_s`; its process group
-    ends with it."""
+    """Runs `dvc ...` with this Python on the code of this folder; `log` gets its output. Raises ValueError
+    with its own sentence if it fails, and TooLongError if it takes longer than `limit_s`; then its process
+    group ends with it."""
     target = log or STATE / "dvc.log"
     target.parent.mkdir(parents=True, exist_ok=True)
     first = {"PATH": str(Path(sys.executable).parent), "PYTHONPATH": str(Path.cwd())}
@@ -108,7 +110,7 @@ def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> None
             os.killpg(child.pid, signal.SIGKILL)
             child.wait()
     if status:
-        # on a full disk the log is cut off, and says nothing
+        # on a full disk the log is incomplete and gives no reason
         free_mb = shutil.disk_usage(Path()).free / 1e6
         full = f"; no space left on device ({free_mb:.1f} MB); free some" if free_mb < FULL_MB else ""
         text = target.read_text(encoding="utf-8", errors="replace")
@@ -116,7 +118,8 @@ def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> None
 
 
 def find_sentence(text: str) -> str:
-    """Of what dvc and its stages printed: the stage's own sentence if it has one, else dvc's last error."""
+    """Returns from the output of dvc and its stages the stage's own sentence if it has one, else dvc's last
+    error."""
     lines = [line.strip() for line in text.replace("\r", "\n").splitlines() if line.strip()]
     stages = [line.split("'")[1] for line in lines if line.startswith("Running stage '")]
     own = [line for line in lines if stages and line.startswith(f"{stages[-1]}: ") and "|" not in line]
@@ -128,8 +131,8 @@ def find_sentence(text: str) -> str:
 
 
 def remove_stale_locks() -> None:
-    """Removes what a killed DVC left half written, and lock files of git if no git is at work here: an editor
-    may be open for hours over `git commit -a`, which holds its lock."""
+    """Removes half-written files of a killed DVC, and git's lock files if no git is running here. An editor
+    may be open for hours during `git commit -a`, which holds its lock."""
     rwlock = Path(".dvc/tmp/rwlock")
     try:
         json.loads(rwlock.read_bytes() if rwlock.exists() else b"{}")
@@ -147,7 +150,7 @@ def remove_stale_locks() -> None:
 
 
 def _git_works() -> bool:
-    """Whether a git is at work in the project; True if the system cannot tell."""
+    """Returns whether a git process is running in the project; True if the system cannot tell."""
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             if (entry / "comm").read_text().strip() != "git":

@@ -1,7 +1,8 @@
-"""Champion and challenger of each loop. A challenger that does not pass the rules of its page is a candidate,
-which nothing runs; one that passes goes in production if it is better than the champion, or there is none.
-The verdict of each loop is that of the run, with the drift of tonight and with the controllers that are in
-production.
+"""Compares champion and challenger of each loop. A challenger that does not pass the rules of its page
+becomes a candidate, which is stored but not run. One that passes goes into production if it is better than
+the champion, or if there is no champion.
+
+The verdict of each loop is that of this run, with this run's drift and with the controllers in production.
 """
 
 from collections.abc import Mapping
@@ -31,9 +32,9 @@ from pipeline.verdict.verdict import PASSED, Verdict
 
 STORED = "datasets/verdict"
 REPORT = "datasets/report/figures.json"
-# artifacts that only some contestants are designed from, and that a record may not determine
+# artifacts that only some controllers are designed from, and that a record may not determine
 OPTIONAL = {f"datasets/{path}" for path in judge.DESIGNED_FROM.values()}
-# the certified controller of the temperature loop, installed beside what it was designed from
+# the certified controller of the temperature loop, stored beside the artifacts that it was designed from
 CERTIFYING, EXPORTED = "export_controllers", "datasets/export_controllers/temperature"
 CERTIFICATE = f"{EXPORTED}/certificate.json"
 CERTIFIED = (f"{EXPORTED}/controller.json", f"{EXPORTED}/arrays.safetensors", CERTIFICATE)
@@ -42,15 +43,14 @@ CERTIFIED = (f"{EXPORTED}/controller.json", f"{EXPORTED}/arrays.safetensors", CE
 def judge_all(
     settings: Nightly, night: Night, state: ChampionState, lineage: Mapping[str, Any]
 ) -> ChampionState:
-    """What is in production, and the candidates beside it; the night has a decision on each loop. Their files
-    lie in champion/<loop> and champion/<loop>.candidate by then. Raises ValueError if no loop can be
-    judged."""
+    """Decides on each loop and returns the new state of production and candidates. Their files then lie in
+    champion/<loop> and champion/<loop>.candidate. Raises ValueError if no loop can be judged."""
     by_loop = read_verdicts(settings, night)
     for name in settings.loops:
         verdict = by_loop.get(name)
         try:
             decision = judge_loop(settings, name, night, state, verdict)
-        except reporting.REFUSALS as error:  # what cannot be judged stops no other loop
+        except reporting.REFUSALS as error:  # a loop that cannot be judged stops no other loop
             why = " ".join(str(error).split())
             decision = LoopDecision(records.FAILED, [f"it cannot be judged, and its champion stays: {why}"])
         decision = decision._replace(verdict=verdict and verdict._replace(rules=()))
@@ -59,7 +59,7 @@ def judge_all(
         if decision.promotes or waits:
             state = _place(settings.loops[name], name, night, state, lineage)
         if name in state.candidates and not waits and verdict and verdict.state == PASSED:
-            # what did not pass before it is of no more use
+            # the earlier candidate, which did not pass, is no longer needed
             champion.remove(candidate_of(name))
             others = {loop: one for loop, one in state.candidates.items() if loop != name}
             state = state._replace(candidates=others)
@@ -75,9 +75,9 @@ def judge_all(
 
 
 def read_verdicts(settings: Nightly, night: Night) -> dict[str, Verdict]:
-    """The verdict of each loop that has a page, as pages say it. A loop that is judged by a file of costs has
-    none: its rules are the guards of that file. If nightly.holdout.controller names a controller, the
-    temperature loop's verdict is about that one."""
+    """Returns the verdict of each loop that has a page, as on the pages. A loop judged by a file of costs has
+    none; the guards of that file are its rules. If nightly.holdout.controller names a controller, the
+    temperature loop's verdict is about that one. Raises ValueError if a verdict is missing."""
     loops = [name for name, loop in settings.loops.items() if loop.judge != "cases"]
     if not loops:
         return {}
@@ -96,8 +96,8 @@ def read_verdicts(settings: Nightly, night: Night) -> dict[str, Verdict]:
 
 
 def _make_pages_agree(pages: Mapping[str, Verdict], night: Night) -> None:
-    """Makes the pages anew if they were made before drift or production changed, so that they say what the
-    night goes by."""
+    """Renders the pages again if they were made before drift or production changed, so that they agree with
+    this run."""
     shown = (artifacts.read_json(REPORT).get("verdicts") or {}) if artifacts.exists(REPORT) else None
     if shown is None or all(shown.get(loop) == verdict.metrics() for loop, verdict in pages.items()):
         return
@@ -113,7 +113,7 @@ def _make_pages_agree(pages: Mapping[str, Verdict], night: Night) -> None:
 def judge_loop(
     settings: Nightly, name: str, night: Night, state: ChampionState, verdict: Verdict | None
 ) -> LoopDecision:
-    """What becomes of the challenger of one loop; `verdict` is None if the loop has no page."""
+    """Returns the decision on the challenger of one loop; `verdict` is None if the loop has no page."""
     loop, present, files = settings.loops[name], state.champions.get(name), list_files(settings.loops[name])
     contestant = verdict.subject if verdict else ""
     runs = (present.contestant if present else "") or contestant
@@ -155,13 +155,13 @@ def _keep(reason: str) -> LoopDecision:
 
 
 def list_files(loop: NightlyLoop) -> list[str]:
-    """The artifacts of a loop without the optional ones that its record did not determine."""
+    """Returns the artifacts of a loop, without optional ones that its record did not determine."""
     return [path for path in loop.artifacts if path not in OPTIONAL or Path(path).is_file()]
 
 
 def find_missing_certificate(loop: NightlyLoop, contestant: str) -> str:
-    """Why a challenger of the temperature loop that passes the page's rules has no certificate; empty if it
-    has one, and if the project has no stage that certifies."""
+    """Returns why a challenger of the temperature loop that passes the page's rules has no certificate.
+    Returns "" if it has one, or if the project has no stage that certifies."""
     if not _asks_for_one(loop):
         return ""
     if not artifacts.exists(CERTIFICATE):
@@ -176,8 +176,8 @@ def find_missing_certificate(loop: NightlyLoop, contestant: str) -> str:
 
 
 def _asks_for_one(loop: NightlyLoop) -> bool:
-    """Whether a loop's champion needs a certificate: that of the temperature loop, if the project has the
-    stage that certifies."""
+    """Returns whether a loop's champion needs a certificate: only that of the temperature loop, if the
+    project has the stage that certifies."""
     return loop.judge == "temperature" and CERTIFYING in read_stages("dvc.yaml")
 
 
@@ -187,7 +187,8 @@ def _asks_for_one(loop: NightlyLoop) -> bool:
 def _place(
     loop: NightlyLoop, name: str, night: Night, state: ChampionState, lineage: Mapping[str, Any]
 ) -> ChampionState:
-    """The state with a challenger in production or as the candidate; its files lie in that folder then."""
+    """Puts a challenger into production, or stores it as the candidate, and returns the new state. Its files
+    then lie in that folder."""
     decision = night.decisions[name]
     waits, verdict = not decision.promotes, decision.verdict
     files, why = list_files(loop), "; ".join(decision.reasons)

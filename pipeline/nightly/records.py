@@ -1,6 +1,7 @@
-"""The records of the nightly job: what a night found of drift, what is in production, and what was decided.
+"""The records of the nightly job: drift that a run found, what is in production, and what was decided.
 
-.beadline/memory.json, reports/metrics/nightly.json and champion.json hold them, and the page reads them.
+They are stored in .beadline/memory.json, reports/metrics/nightly.json and champion.json, and the page reads
+them.
 """
 
 import dataclasses
@@ -17,7 +18,8 @@ R = TypeVar("R")
 
 
 def to_json(value: Any) -> Any:
-    """A record as JSON: its fields by name, tuples as lists. JSON knows no infinity: it is null."""
+    """Returns a record as JSON: its fields by name, tuples as lists. Numbers that are not finite become null,
+    since JSON has no infinity."""
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
         value = value._asdict()
     elif dataclasses.is_dataclass(value):
@@ -30,8 +32,8 @@ def to_json(value: Any) -> Any:
 
 
 def from_json(record: type[R], fields: Any) -> R:
-    """What `to_json` gave of a record; fields that are missing are as declared. Raises ValueError if one is
-    missing that has no value otherwise, or is of another kind."""
+    """Returns the record from what `to_json` gave; missing fields get their defaults. Raises ValueError if a
+    field without a default is missing, or if a field has another type."""
     try:
         return pydantic.TypeAdapter(record).validate_python(fields)
     except pydantic.ValidationError as error:
@@ -42,16 +44,16 @@ def from_json(record: type[R], fields: Any) -> R:
 
 # ---- drift
 
-PLANT = "temperature"  # the loop whose recordings tell of the plant's parameters
-SENSOR = "sensor"  # kind of an alarm that stands above every other: a sensor that stands still
+PLANT = "temperature"  # the loop whose recordings show the plant's parameters
+SENSOR = "sensor"  # the most urgent kind of alarm: a sensor that stands still
 
 
 class Alarm(NamedTuple):
-    """A change of one loop: the key by which the next night knows it again, and the recording that shows it.
-    Then its cause in words, how many sigmas it is from no change, and what follows from it in words. `kind`
-    and `channel` are the cause for a machine to read, empty where it has none: gain, time constant, delay,
-    saturation, offset, noise, ambient, sensor, or several with "or" between; a signal's name, or "every
-    input"."""
+    """A change in one loop. `key`: by which the next run recognises it; `recording`: that shows it; `cause`:
+    in words; `sigmas`: distance from no change; `consequences`: in words. `kind` and `channel` give the
+    cause for a machine to read, and are empty if there is none. `kind`: gain, time constant, delay,
+    saturation, offset, noise, ambient, sensor, or several joined by "or"; `channel`: a signal's name, or
+    "every input"."""
 
     loop: str
     key: str
@@ -64,19 +66,20 @@ class Alarm(NamedTuple):
 
 
 def sort_alarms(alarms: Sequence[Alarm]) -> list[Alarm]:
-    """A sensor that stands still first."""
+    """Returns the alarms, with sensors that stand still first."""
     return sorted(alarms, key=lambda alarm: alarm.kind != SENSOR)
 
 
 @dataclasses.dataclass
 class NightDrift:
-    """What new recordings say of the machines and cameras: alarms, what would be one if it stayed, and why
-    recordings were set aside; notes.
+    """Drift of machines and cameras in new recordings: alarms; `watched`, what becomes an alarm if it
+    persists; reasons why recordings were set aside; notes.
 
-    `figures` has what the champion's observer measured on each recording against the champion's own:
-    `parameters` of the plant {percent, band_percent (half of the 90 % band), sigmas}; `innovation` of each
-    output {noise_percent, noise_sigmas, mean_degC, mean_sigmas}; `closed_loop` {moved, sigmas};
-    `not_applicable`, why the closed loop was not asked; `least`, the smallest changes that would have shown.
+    `figures`: what the champion's observer measured on each recording, compared with the champion's own
+    recordings. `parameters` of the plant {percent, band_percent (half of the 90 % band), sigmas};
+    `innovation` of each output {noise_percent, noise_sigmas, mean_degC, mean_sigmas}; `closed_loop` {moved,
+    sigmas}; `not_applicable`, why the closed loop was not compared; `least`, the smallest changes that would
+    have shown.
     """
 
     alarms: list[Alarm] = dataclasses.field(default_factory=list)
@@ -92,17 +95,18 @@ ROLLED_BACK, DRIFT_ACCEPTED = "rolled back", "drift accepted"  # events of the h
 
 
 def candidate_of(loop: str) -> str:
-    """The folder below champion/ that a loop's candidate lies in."""
+    """Returns the folder below champion/ that holds a loop's candidate."""
     return f"{loop}.candidate"
 
 
 class Champion(NamedTuple):
-    """One loop's champion, or a candidate: the night that made it, when and why; what DVC's pointer says of
-    its folder, and MD5 of its files by path. `since` is the time of a rollback to it.
+    """A loop's champion (the controller in production), or a candidate: the run that made it, when and why;
+    `folder`, what DVC's pointer says of its folder; `files`, MD5 of its files by path. `since`: time of a
+    rollback to it.
 
-    `lineage`: the `commit` that the night worked from, and what lay `uncommitted` on it. `contestant` is the
-    controller that runs, by its name on the pages. `rehearsal`: it was judged on simulated data alone.
-    `verdict` is what the page said of it then.
+    `lineage`: the `commit` from which the run worked, and its `uncommitted` changes. `contestant`: the
+    controller that runs, by its name on the pages. `rehearsal`: it was judged on simulated data only.
+    `verdict`: what the page said of it then.
     """
 
     run: str
@@ -118,14 +122,14 @@ class Champion(NamedTuple):
 
     @property
     def md5(self) -> str:
-        """DVC's hash of the whole folder."""
+        """Returns DVC's hash of the whole folder."""
         return self.folder["md5"]
 
 
 class HistoryLine(NamedTuple):
-    """One change of production: which loop, what happened, when and why, and the champion from then on.
-    `before` is the run of the champion until then, None if there was none. `replaced` are the files of the
-    champion that a rollback took out, MD5 by path."""
+    """One change of production: loop, event, when and why, and the champion from then on. `before`: run of
+    the previous champion, None if there was none. `replaced`: files of the champion that a rollback removed,
+    MD5 by path."""
 
     run: str
     loop: str
@@ -138,8 +142,8 @@ class HistoryLine(NamedTuple):
 
 
 class ChampionState(NamedTuple):
-    """champion.json: {loop: champion}, and every change of production, the oldest first. `candidates`: of
-    each loop the last challenger that did not pass the page's rules; its files lie in
+    """Content of champion.json: {loop: champion}, and every change of production, the oldest first.
+    `candidates`: for each loop the last challenger that did not pass the page's rules; its files lie in
     champion/<loop>.candidate, and nothing runs them."""
 
     champions: Mapping[str, Champion] = {}
@@ -148,7 +152,7 @@ class ChampionState(NamedTuple):
 
     @property
     def folders(self) -> dict[str, Champion]:
-        """What lies below champion/, by folder."""
+        """Returns what lies below champion/, by folder."""
         waiting = {candidate_of(loop): candidate for loop, candidate in self.candidates.items()}
         return {**self.champions, **waiting}
 
@@ -162,10 +166,10 @@ FAILED, QUARANTINED, NOTHING_NEW = "failed", "quarantined", "nothing new"
 
 
 class LoopDecision(NamedTuple):
-    """What was decided of one loop's challenger, and why: promoted, kept, first champion, candidate or
-    failed. `paired` is the test of challenger against champion, None if they were not compared. `guards` are
-    figures of which less is better, {name: {champion, challenger, allowed}}, None if there is no such figure.
-    `verdict` is the page's on this loop without its rules, None if it has no page."""
+    """The decision on one loop's challenger, and why: promoted, kept, first champion, candidate or failed.
+    `paired`: test of challenger against champion, None if they were not compared. `guards`: figures of which
+    less is better, {name: {champion, challenger, allowed}}, None if a figure does not exist. `verdict`: the
+    page's on this loop without its rules, None if it has no page."""
 
     decision: str
     reasons: list[str]
@@ -180,12 +184,12 @@ class LoopDecision(NamedTuple):
 
 @dataclasses.dataclass
 class Night:
-    """One night: its number, name and time; how it ended and why, and what else is to be said.
+    """One nightly run: `number`, `run` (its name) and `when`; `outcome`, `reasons` and `notes`.
 
-    New recordings by loop, and {path: {used_percent, masked_percent, cut_percent}} of them; drift. What was
-    decided of each loop. The commit, whether its artifacts have yet to reach the remote, and how long the
-    night took in s. The branch that its promotions wait on, empty if they are in production. `idle`: nights
-    in a row without a new recording, this one among them.
+    `new_recordings` by loop; `used`, {path: {used_percent, masked_percent, cut_percent}} of them; `drift`;
+    `decisions` on each loop. `commit`; `unpushed`, whether its artifacts have yet to reach the remote;
+    `seconds` that the run took. `branch`: on which its promotions wait, empty if they are in production.
+    `idle`: successive runs without a new recording, including this one.
     """
 
     number: int
@@ -213,17 +217,17 @@ class Night:
 
     @property
     def lost(self) -> list[str]:
-        """The loops whose stages failed, or that could not be judged."""
+        """Returns the loops whose stages failed, or that could not be judged."""
         return [name for name, decision in self.decisions.items() if decision.decision == FAILED]
 
     @property
     def candidates(self) -> dict[str, str]:
-        """The loops whose challenger is a candidate, and what the page says of each."""
+        """Returns the loops whose challenger is a candidate, and what the page says of each."""
         waiting = {name: one for name, one in self.decisions.items() if one.decision == CANDIDATE}
         return {name: "; ".join(decision.reasons) for name, decision in waiting.items()}
 
     def metrics(self, state: ChampionState) -> dict[str, Any]:
-        """As reports/metrics/nightly.json has it, with what is in production."""
+        """Returns the run as in reports/metrics/nightly.json, with what is in production."""
         keys = ("run", "when", "why", "contestant", "rehearsal")
         production, candidates = (
             {name: {key: getattr(one, key) for key in keys} for name, one in champions.items()}
@@ -235,15 +239,15 @@ class Night:
 
 @dataclasses.dataclass
 class Memory:
-    """What the job remembers from night to night, .beadline/memory.json: the last night's number, the time of
-    the last success (empty before the first), the digest of all that it was made from, whether its artifacts
-    have yet to reach the remote, and `idle` as of a night.
+    """What the job remembers from run to run, .beadline/memory.json. `night`: number of the last run;
+    `success`: time of the last success (empty before the first); `inputs`: digest of everything that it was
+    made from; `unpushed`: whether its artifacts have yet to reach the remote; `idle`: as in `Night`.
 
-    `recordings` is {loop: {path: digest}}; `hashes` is {path: [size, time of change, inode, digest]};
-    `nights` is every night, the oldest first. Of the last night with recordings: its alarms, and the keys
-    that it watched or alarmed (`pending`). `drifted` are the recordings of each loop since its alarm.
-    `recent` is what the last nights named of each loop, over which a change is pooled: {loop: {"reference":
-    digest of what they were held against, "nights": [{change: [size, standard deviation]}]}}.
+    `recordings`: {loop: {path: digest}}; `hashes`: {path: [size, time of change, inode, digest]}; `nights`:
+    every run, the oldest first. From the last run with recordings: `alarms`, and `pending`, the keys that it
+    watched or alarmed. `drifted`: recordings of each loop since its alarm. `recent`: changes that the last
+    runs named for each loop, over which a change is pooled: {loop: {"reference": digest of what they were
+    compared with, "nights": [{change: [size, standard deviation]}]}}.
     """
 
     night: int = 0

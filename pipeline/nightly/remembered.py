@@ -1,5 +1,5 @@
-"""What the job remembers from night to night: .beadline/memory.json. Losing it costs one repeated night; a
-broken one is set aside."""
+"""What the job remembers from run to run: .beadline/memory.json. If it is lost, one run is repeated; a broken
+file is set aside."""
 
 import json
 
@@ -12,8 +12,8 @@ LONGEST_HISTORY = 1000
 
 
 def read() -> Memory:
-    """As the last night wrote it; on a fresh clone, what the last commit's metrics say. Raises ValueError if
-    the file is broken."""
+    """Returns the memory that the last run wrote; on a fresh clone, the memory from the last commit's
+    metrics. Raises ValueError if the file is broken."""
     if not FILE.exists():
         fields = json.loads(git("show", f"HEAD:{METRICS}", check=False) or "{}")
         return Memory(fields.get("night", 0), fields.get("when", ""))
@@ -25,8 +25,8 @@ def read() -> Memory:
 
 
 def read_or_set_aside() -> tuple[Memory, list[str]]:
-    """The memory; a broken file becomes .broken, which the note says, and the night looks at everything
-    anew."""
+    """Returns the memory. A broken file is renamed to .broken, with a note, and the run examines everything
+    again."""
     try:
         return read(), []
     except ValueError as error:

@@ -1,5 +1,5 @@
-"""How a night is told: what is remembered of it, its page, the alarm or the heartbeat, and one line. None of
-these may hide the others, nor a mistake of this program the night."""
+"""Reports a nightly run: memory, page, alarm or heartbeat, and one line. If one of these fails, the others
+are still made, and an error of this program does not hide the run."""
 
 import datetime
 import html
@@ -16,17 +16,19 @@ from pipeline.nightly.settings import Nightly
 from pipeline.store import artifacts, params
 
 OK, FAILED, DRIFTED, QUARANTINED, BUSY = 0, 1, 3, 4, 75
-# every night that is remembered, what is in production, and the settings -> the page. The caller brings it,
-# so that the night knows no page
+# returns the page from all remembered runs, the state of production, and the settings. The caller passes it
+# in, so that this package does not depend on pages
 Render = Callable[[Sequence[Night], ChampionState, Nightly], str]
 PAGE = Path("reports/nightly.html")
-# what ends a night in a sentence; anything else is a mistake of this program, whose traceback is in the log
+# errors that are reported in a sentence; any other is an error of this program, and its traceback is in the
+# log
 REFUSALS = (ValueError, OSError, MemoryError, np.linalg.LinAlgError)
-MOST_RECORDS = 3  # of which the summary says what was used
+MOST_RECORDS = 3  # recordings for which the summary says how much was used
 
 
 def tell(error: Exception, run: str) -> str:
-    """An error in one sentence. The traceback of a mistake of this program goes to the night's log."""
+    """Returns an error in one sentence. The traceback of an error of this program is written to the run's
+    log."""
     text = artifacts.reason(error) if isinstance(error, OSError | MemoryError) else str(error)
     sentence = " ".join(text.split())
     if isinstance(error, REFUSALS) and not isinstance(error, UnicodeError):
@@ -43,7 +45,8 @@ def tell(error: Exception, run: str) -> str:
 
 
 def report(night: Night, memory: Memory, settings: Nightly | None, render: Render) -> tuple[int, str]:
-    """Memory, page, alarm or heartbeat; the exit status and the summary. `render` makes the page."""
+    """Writes memory and page, and sends alarm or heartbeat. Returns exit status and summary. `render` makes
+    the page."""
     troubles: list[str] = []
 
     def attempt(part: Callable[[], None]) -> bool:
@@ -88,7 +91,7 @@ def _details(night: Night, status: int) -> dict[str, str | int]:
 
 
 def render_plainly(night: Night, troubles: Sequence[str]) -> str:
-    """A page of sentences, for a night whose own page cannot be made."""
+    """Returns a page of plain sentences, if the run's own page cannot be made."""
     sentences = dict.fromkeys((*night.reasons, *night.notes, *troubles))
     items = "".join(f"<li>{html.escape(sentence)}</li>" for sentence in sentences)
     head = f"{night.run}: {night.outcome or 'ended'}"
@@ -101,7 +104,7 @@ def render_plainly(night: Night, troubles: Sequence[str]) -> str:
 
 
 def exit_status(night: Night) -> int:
-    """What a scheduler is told: the gravest of what the night met."""
+    """Returns the exit status for a scheduler: the most serious event of the run."""
     if night.outcome == records.FAILED or night.unpushed or night.lost:
         return FAILED
     if night.drift.alarms:
@@ -110,7 +113,7 @@ def exit_status(night: Night) -> int:
 
 
 def _alarm(night: Night, status: int, troubles: Sequence[str]) -> tuple[str, list[str]]:
-    """What somebody is woken for, and all of why: the gravest hides none of the others."""
+    """Returns the alarm's kind, by the most serious event, and the reasons of all events."""
     drift, aside = [alarm.cause for alarm in night.drift.alarms], list(night.drift.quarantined.values())
     if status == FAILED:
         lost = [f"{name}: {night.decisions[name].reasons[0]}" for name in night.lost]
@@ -147,8 +150,8 @@ def summarise(night: Night, troubles: Sequence[str]) -> str:
 
 
 def last_resort(error: Exception, now: datetime.datetime) -> tuple[int, str]:
-    """Exit status and summary of a night that could not be begun or reported; somebody is woken all the same,
-    by whatever is known."""
+    """Returns exit status and summary of a run that could not be started or reported. The alarm is sent
+    anyway, with whatever is known."""
     night = Night(0, "nightly", watch.stamp(now))
     night.end(records.FAILED, tell(error, "nightly"))
     settings, _ = load_settings()
@@ -161,16 +164,17 @@ def last_resort(error: Exception, now: datetime.datetime) -> tuple[int, str]:
 
 
 def load_settings() -> tuple[Nightly | None, list[str]]:
-    """Section nightly of the parameters, None if it is broken; and what is wrong with it, as a sentence."""
+    """Returns section nightly of the parameters, None if it is broken, and what is wrong with it, as
+    sentences."""
     try:
         return params.load(Nightly, "nightly"), []
-    except Exception as error:  # nothing in a file of parameters may keep the alarm from going out
+    except Exception as error:  # whatever is in the parameters, the alarm must be sent
         return None, [tell(error, "nightly")]
 
 
 def watchdog(now: datetime.datetime | None = None) -> tuple[int, str]:
-    """Whether somebody should look: no night has succeeded for too long, or what nights work by is broken.
-    The alarm goes out with it. Takes no lock: a night that hangs is seen too."""
+    """Returns exit status and summary of a check: has no run succeeded for too long, or is something broken
+    that runs depend on? If so, sends the alarm. Takes no lock, so it also detects a run that hangs."""
     now = now or datetime.datetime.now(datetime.UTC)
     settings, reasons = load_settings()
     success = ""
@@ -179,7 +183,7 @@ def watchdog(now: datetime.datetime | None = None) -> tuple[int, str]:
         success = remembered.read().success
         if settings:
             reasons += filter(None, [watch.find_overdue(now, success, settings.watch_h)])
-    except Exception as error:  # a watchdog that dies would be the most silent of all
+    except Exception as error:  # a watchdog that crashes would not warn anybody
         reasons.append(tell(error, "watch"))
     if not reasons:
         return OK, f"nightly: watch: the last success was at {success}"

@@ -1,4 +1,5 @@
-"""`dvc repro` by loop, in the copy: a stage that fails stops what follows from it, and no other loop."""
+"""Runs `dvc repro` by loop, in the copy. A stage that fails stops the stages that depend on it, but no other
+loop."""
 
 import contextlib
 from collections.abc import Mapping, Sequence
@@ -15,9 +16,9 @@ from pipeline.store import artifacts
 def reproduce(
     loops: Mapping[str, NightlyLoop], log: Path, *, limit_s: float
 ) -> tuple[dict[str, str], list[str]]:
-    """Runs the stages: {loop: why it failed}, and what else is to be said. What a loop that failed has made
-    is as it was before the night, and pages of several loops are made of that. Raises ValueError if no loop
-    went well, or a stage of all of them failed, and TooLongError if the stages take longer than `limit_s`."""
+    """Runs the stages. Returns {loop: why it failed}, and notes. The outputs of a failed loop are restored to
+    those before the run, and pages of several loops are made from these. Raises ValueError if no loop
+    succeeded, or a stage of all of them failed, and TooLongError if the stages take longer than `limit_s`."""
     try:
         dvc("repro", "--keep-going", log=log, limit_s=limit_s)
         return {}, []
@@ -31,7 +32,7 @@ def reproduce(
     for name in loops:
         stages = [stage for stage, several in loops_of.items() if name in several and several != {*loops}]
         try:
-            if stages:  # what is made already takes no time, and what failed says why
+            if stages:  # stages already made take no time, and a failed one gives its reason
                 dvc("repro", *stages, log=log.with_suffix(f".{name}.log"), limit_s=limit_s)
         except ValueError as error:
             lost[name] = str(error)
@@ -49,7 +50,8 @@ def reproduce(
 
 
 def read_stages(path: str) -> dict[str, Any]:
-    """The stages of dvc.yaml or dvc.lock; none without such a file. Raises ValueError if it is broken."""
+    """Returns the stages of dvc.yaml or dvc.lock; none if there is no such file. Raises ValueError if it is
+    broken."""
     try:
         text = Path(path).read_text(encoding="utf-8") if Path(path).exists() else ""
         stages = (yaml.safe_load(text) or {}).get("stages") or {}
@@ -68,7 +70,8 @@ def outs_of(stage: Mapping[str, Any]) -> list[str]:
 
 
 def read_upstream() -> dict[str, set[str]]:
-    """Of each stage of dvc.yaml all that it depends on, near and far, itself among it."""
+    """Returns for each stage of dvc.yaml all stages on which it depends, directly or not, including
+    itself."""
     stages = read_stages("dvc.yaml")
     reads = {name: _find_makers(stages, stage.get("deps", [])) for name, stage in stages.items()}
     upstream = {name: {name} for name in stages}
@@ -78,7 +81,7 @@ def read_upstream() -> dict[str, set[str]]:
 
 
 def _find_makers(stages: Mapping[str, Any], paths: Sequence[str]) -> set[str]:
-    """The stages with an out that lies at one of these paths, in it or around it."""
+    """Returns the stages with an output at, below or above one of these paths."""
     return {
         name
         for name, stage in stages.items()
@@ -89,8 +92,8 @@ def _find_makers(stages: Mapping[str, Any], paths: Sequence[str]) -> set[str]:
 
 
 def _find_loops(loops: Mapping[str, NightlyLoop], upstream: Mapping[str, set[str]]) -> dict[str, set[str]]:
-    """{stage: the loops it belongs to}: those whose artifacts depend on it, or on which it depends. A page of
-    all belongs to every loop."""
+    """Returns {stage: its loops}: those whose artifacts depend on it, or on whose artifacts it depends. A
+    page of all loops belongs to every loop."""
     stages = read_stages("dvc.yaml")
     needed = {
         name: set().union(*(upstream[maker] for maker in _find_makers(stages, loop.artifacts)))
@@ -103,7 +106,8 @@ def _find_loops(loops: Mapping[str, NightlyLoop], upstream: Mapping[str, set[str
 
 
 def _undo(stages: set[str]) -> None:
-    """What these stages wrote is as it was before the night: dvc.lock, the files that git keeps, outs."""
+    """Restores what these stages wrote to the state before the run: dvc.lock, files that git keeps, and
+    outputs."""
     before = (yaml.safe_load(git("show", "HEAD:dvc.lock", check=False)) or {}).get("stages", {})
     entries = {name: entry for name, entry in read_stages("dvc.lock").items() if name not in stages}
     entries |= {name: before[name] for name in stages if name in before}
@@ -113,5 +117,5 @@ def _undo(stages: set[str]) -> None:
     for out in (out for name in stages for out in outs_of(wired[name])):
         git("checkout", "-q", "HEAD", "--", out, check=False)
     if known := [name for name in stages if name in before]:
-        with contextlib.suppress(ValueError):  # what is in no cache is made by the next repro
+        with contextlib.suppress(ValueError):  # outputs in no cache are made by the next repro
             dvc("checkout", "--quiet", "--force", *known)

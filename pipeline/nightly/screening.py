@@ -1,5 +1,5 @@
-"""New recordings before anything learns from them: what cannot be read or is not what it says goes to
-quarantine; what has changed since the champion was made is drift."""
+"""Checks new recordings before anything learns from them. A recording that cannot be read or has a recording
+mistake is quarantined; a change since the champion was made is drift."""
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -15,9 +15,9 @@ from pipeline.store import artifacts, params
 def look(
     settings: Nightly, champions: Collection[str], new: Mapping[str, Sequence[str]], memory: Memory
 ) -> NightDrift:
-    """New recordings {loop: paths} held against those of each loop's champion; `champions` are the loops that
-    have one. `memory`, that of the night before, then has what the next night must know of this one. A loop's
-    alarms say nothing of another loop. If nothing was recorded, what was found last still stands."""
+    """Compares new recordings {loop: paths} with those of each loop's champion; `champions`: the loops that
+    have one. `memory` is that of the run before, and is updated for the next run. A loop's alarms do not
+    concern other loops. If there is no new recording, the last alarms are still valid."""
     drift = NightDrift()
     if not new:
         drift.alarms += memory.alarms
@@ -36,7 +36,7 @@ def look(
             pictures.find_prints_drift(
                 drift, limits, name, loop.recordings, paths, own, _read(own), memory.pending
             )
-        # what each loop recorded since its alarm: a person may accept that as how things are
+        # recordings of each loop since its alarm: a person may accept these as the new normal
         raised = [a.recording for a in drift.alarms if a.loop == name and a.kind != SENSOR]
         drifted[name] = list(dict.fromkeys([*drifted.get(name, []), *raised])) if raised else []
     drift.alarms = sort_alarms(drift.alarms)
@@ -46,10 +46,10 @@ def look(
 
 
 def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict[str, Any] | None:
-    """What the recordings that a challenger was made of say of its own model, for
-    champion/<loop>/reference.json: a night's figures mean something only beside those of nights that are
-    known to be good; `only` these recordings, or prints, if any are named. None if the loop has no
-    recordings, or too short ones."""
+    """Returns the content of champion/<loop>/reference.json: results of a challenger's own recordings with
+    its own model. Figures of a night are meaningful only if compared with nights that are known to be good.
+    `only`: these recordings, or prints, if any are named. Returns None if the loop has no recordings, or too
+    short ones."""
     if not loop.recordings or not Path(loop.recordings).is_dir():
         return None
     if loop.judge in ("deposition", "setpoint"):
@@ -66,7 +66,7 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
 
 
 def _read(folder: Path) -> list[Any]:
-    """What reference.json says of the camera."""
+    """Returns the camera's figures in reference.json."""
     path = folder / REFERENCE
     return artifacts.read_json(path).get("camera", []) if path.exists() else []
 

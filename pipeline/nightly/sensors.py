@@ -1,13 +1,13 @@
-"""Sensors of a recording that stand still while the machine moves: what the supervisor of a controller says,
-asked of the record sample by sample.
+"""Finds sensors of a recording that stand still while the machine moves, by the same test as a controller's
+supervisor, sample by sample.
 
-The supervisor's forecasts last 36 samples, in which a slow zone hardly moves. A record is there as a whole,
-so it is asked again with samples 4 and 16 times as far apart: the model over s samples is
+The supervisor's forecasts last 36 samples, in which a slow zone hardly moves. A record is available as a
+whole, so it is also tested with samples 4 and 16 times as far apart. The model over s samples is
 
     x(t+s) = A^s x(t) + (I + A + ... + A^(s-1)) (B u + b),    u the mean of the inputs meanwhile
 
-While a good loop holds a zone, the model foretells no move that could be missing. A sensor whose noise is not
-small beside its step then still turns back every few samples, and one that is stuck does not.
+If a good loop holds a zone constant, the model predicts no move that could be missing. But a sensor whose
+noise is not small compared with its step still turns back every few samples, and a stuck one does not.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,18 +23,18 @@ from pipeline.temperature.settings import Plant as Machine
 
 Segments = Sequence[tuple[np.ndarray, np.ndarray]]
 KINDS = (OPEN, STILL)
-SPACINGS = (1, 4, 16)  # samples from one that is asked to the next
-GONE = 30  # samples without a number that an honest log may have, all together
-ON = 0.01  # share of a heater's range that is given by one that is on
+SPACINGS = (1, 4, 16)  # distances between tested samples
+GONE = 30  # samples without a number that an honest log may have in total
+ON = 0.01  # fraction of its range above which a heater counts as on
 LASTS = 60  # samples for which a sensor stays in doubt: one that only seems to stand still soon moves again
-SHARE = 1 / 3  # of a record, if it is not in doubt to the end: a good loop holds a coarse sensor still
-RESTLESS = 0.15  # share of samples at which a sensor turns back, whose noise is a quarter of its step or more
-MISSING = 30.0  # reversals that a sensor that turns back so often owes, before it is said to be stuck
+SHARE = 1 / 3  # of a record, unless the doubt lasts to its end: a good loop may hold a coarse sensor still
+RESTLESS = 0.15  # fraction of samples at which a sensor turns back if its noise is 1/4 of its step or more
+MISSING = 30.0  # missing reversals after which such a sensor counts as stuck
 
 
 class SensorFault(NamedTuple):
-    """An output that stands still or gives no number: its name, which of KINDS, why in one sentence, and the
-    sample of the record by which that is certain."""
+    """An output that stands still or gives no number: its name, one of KINDS, the reason in one sentence, and
+    the sample of the record at which it is certain."""
 
     output: str
     kind: int
@@ -43,20 +43,21 @@ class SensorFault(NamedTuple):
 
     @property
     def rank(self) -> tuple[int, int]:
-        """The surest first."""
+        """Returns a key that sorts the most certain fault first."""
         return self.kind, self.sample
 
 
 def smallest_changes(records: Sequence[Segments], unmoved: float = supervise.MOST_STEP_DEGC) -> np.ndarray:
-    """The smallest change (p,) of each sensor in records, in °C; `unmoved` if there is none."""
+    """Returns the smallest change (p,) of each sensor in the records, in °C; `unmoved` if it never
+    changes."""
     moves = np.concatenate([np.abs(np.diff(y, axis=0)) for record in records for _, y in record])
     least = np.where(moves > 1e-9, moves, np.inf).min(axis=0)
     return np.where(np.isfinite(least), least, unmoved)
 
 
 def reversals(records: Sequence[Segments]) -> np.ndarray:
-    """The share (p,) of samples of honest records at which each sensor turns back after one sample: it is
-    low for a sensor whose noise is small beside its step."""
+    """Returns the fraction (p,) of samples of honest records at which each sensor turns back after one
+    sample. It is low for a sensor with noise that is small compared with its step."""
     turns = np.concatenate([
         np.diff(y[:-1], axis=0) * np.diff(y[1:], axis=0) < 0 for record in records for _, y in record
     ])  # fmt: skip
@@ -72,9 +73,9 @@ def faults(
     steps: np.ndarray,
     reversals: np.ndarray,
 ) -> list[SensorFault]:
-    """The sensors that are in doubt in a record of inputs u (T, m) and readings y (T, p), masked ones too, by
-    the machine's model, and by noise (p,) and steps (p,) of its sensors in °C and their share of reversals
-    (p,) in honest records; the surest first."""
+    """Returns the sensors in doubt in a record of inputs u (T, m) and readings y (T, p), including masked
+    ones, the most certain first. `model`: of the machine; `noise` (p,) and `steps` (p,): of its sensors in
+    °C; `reversals` (p,): their fraction of reversals in honest records."""
     wired = supervise.Machine(
         tuple(Signal(one.name, supervise.PERCENT, one.low, one.high) for one in machine.inputs),
         tuple(
@@ -89,7 +90,7 @@ def faults(
         machine.sample_time_s,
     )
     supervision = assembly.supervision(strictly_proper(model), wired, noise)
-    # a logger may round to coarser steps from tonight on, in which a healthy sensor turns back less often
+    # the logger may now round to coarser steps, with which a healthy sensor turns back less often
     tonight = np.minimum(smallest_changes([segments], 0.0), supervise.MOST_STEP_DEGC)
     often = np.where(tonight > 2 * np.maximum(steps, noise), 0.0, reversals)
     steps = np.maximum(steps, tonight)
@@ -106,8 +107,8 @@ def faults(
 def _find_stuck(
     s: Supervision, machine: supervise.Machine, segments: Segments, reversals: np.ndarray
 ) -> Iterator[SensorFault]:
-    """Every sensor that gives one and the same reading for a third of the record while its heater is on, and
-    that should have turned back many times meanwhile."""
+    """Yields every sensor that gives the same reading for a third of the record while its heater is on,
+    although it should have turned back many times meanwhile."""
     begin, samples = 0, sum(len(y) for _, y in segments)
     for u, y in segments:
         for i in np.flatnonzero(reversals >= RESTLESS):
@@ -124,12 +125,12 @@ def _find_stuck(
 
 
 def _heater_of(s: Supervision, output: int) -> int:
-    """The input that an output answers to most."""
+    """Returns the input to which an output responds most."""
     return int(s.input_of[int((s.of_input == output).argmax())])
 
 
 def _rarer(model: Plant, spacing: int) -> Plant:
-    """The model over `spacing` samples."""
+    """Returns the model over `spacing` samples."""
     total, power = np.zeros_like(model.A), np.eye(model.n)
     for _ in range(spacing):
         total, power = total + power, power @ model.A
@@ -141,7 +142,7 @@ def _rarer(model: Plant, spacing: int) -> Plant:
 def _follow(
     s: Supervision, machine: supervise.Machine, segments: Segments, spacing: int, steps: np.ndarray
 ) -> Iterator[SensorFault]:
-    """Every sensor in doubt, once."""
+    """Yields every sensor in doubt, once."""
     silent, told, begin = np.zeros(len(s.d), int), set(), 0
     last = sum(len(y) for _, y in segments) - 1
     heaters = [_heater_of(s, i) for i in range(len(s.d))]
@@ -157,7 +158,7 @@ def _follow(
             there = k.since[list(KINDS), : len(s.d)] >= 0
             if (there & (doubtful == 0)).any():
                 before = u[max(t - spacing * WINDOWS * SPACING, 0) : t + 1, heaters]
-                # what the model does of itself, of a machine that is cold and off, says nothing
+                # moves of the model alone, with the machine cold and off, are no evidence
                 off = before.max(axis=0) - s.low[heaters] < ON * (s.high - s.low)[heaters]
                 unfounded[1:] |= (there & (doubtful == 0))[1:] & off
             unfounded &= there

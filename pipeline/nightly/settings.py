@@ -1,4 +1,4 @@
-"""Section `nightly` of the parameters: when to promote, what is drift, who is woken."""
+"""Section `nightly` of the parameters: when to promote, what counts as drift, and who is notified."""
 
 import re
 from typing import Annotated, Literal
@@ -10,7 +10,7 @@ from pipeline.store.params import Section
 
 
 def _in_the_project(path: str) -> str:
-    """A path that the night copies or moves. Raises ValueError where it lies elsewhere."""
+    """Returns a path that a run copies or moves. Raises ValueError if it lies outside the project."""
     if path.startswith(("/", "~")) or ".." in path.split("/"):
         raise ValueError("but must lie in the project's folder")
     return path
@@ -21,8 +21,8 @@ Path = Annotated[str, Field(min_length=1, max_length=300), Inside]
 
 
 class NightlyLoop(Section):
-    """One control loop: the files that are its controller, and where the judge finds its evidence: a
-    panel of its own (temperature), what its stage scored on cases that nothing was trained on
+    """One control loop: the files of its controller (`artifacts`), and the source of the judge's evidence.
+    This is a test set of its own (temperature), what its stage scored on cases that nothing was trained on
     (deposition, setpoint), or a file of costs by case."""
 
     artifacts: list[Path] = Field(min_length=1, max_length=50)
@@ -46,7 +46,8 @@ class NightlyLoop(Section):
 
 
 class PromotionRule(Section):
-    """Better beyond noise, by a margin worth a change, and no guard worse by more than is allowed."""
+    """A challenger must be better beyond noise, by a margin worth a change, and no guard may be worse by more
+    than allowed."""
 
     level: float = Field(gt=0, le=0.2)
     least_improvement_percent: float = Field(ge=0, le=100)
@@ -57,9 +58,9 @@ class PromotionRule(Section):
 
 
 class HoldOut(Section):
-    """The temperature loop's hold-out: which contestant runs on the machine, on how many plants, from which
-    starts to which references, with a seed that no stage uses; recordings of `recordings` make the plants.
-    `page`: the contestant that the page names."""
+    """The temperature loop's hold-out test: `controller` that runs on the machine (`page`: the one that the
+    page names); on how many `plants`; from which starts to which references; `seed`, which no stage uses. The
+    plants are made from the recordings in `recordings`."""
 
     controller: Literal[
         "page",
@@ -83,9 +84,9 @@ class HoldOut(Section):
 
 
 class DriftLimits(Section):
-    """What matters of each figure, and how sure the night must be. A change of the machine is an alarm where
-    its estimate, pooled over nights, is past its limit by `limit_sigmas`; a picture or the closed loop where
-    it leaves its band by `alarm_sigmas` at once, or by `watch_sigmas` two nights running."""
+    """Limits of each figure, and the required certainty. A change of the machine is an alarm if its estimate,
+    pooled over nights, is past its limit by `limit_sigmas`. A change of a picture or of the closed loop is an
+    alarm if it leaves its band by `alarm_sigmas` at once, or by `watch_sigmas` in two successive runs."""
 
     limit_sigmas: float = Field(ge=0, le=100)
     alarm_sigmas: float = Field(gt=1, le=100)

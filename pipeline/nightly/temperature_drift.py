@@ -1,5 +1,6 @@
-"""The temperature loop's part of a night: new recordings held against those of the champion. A record that is
-not what it says is set aside, and what it says of the machine, put right, counts all the same."""
+"""The temperature loop's part of a nightly run: compares new recordings with those of the champion. A record
+with a recording mistake is set aside, but what it shows of the machine once the mistake is undone still
+counts."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,13 +21,14 @@ from pipeline.temperature.settings import Plant, recorded
 from pipeline.temperature.tables import set_point_of
 
 REFERENCE = "reference.json"  # in the champion's folder
-PIECES = 4  # into which a single record of the champion is cut, to stand for nights
-NIGHTS = 12  # of the champion's own recordings that a new one is held against
-# a rival so far past its limit, in units of it, is said before the likeliest cause, which is within its own
+PIECES = 4  # into which a single record of the champion is cut; each is used as one night
+NIGHTS = 12  # number of the champion's own recordings with which a new one is compared
+# a rival that is this many times its limit is named before the likeliest cause, if that one is within its
+# limit
 AHEAD = 2.0
-LONGEST = 7200  # samples of a record that are asked, its last ones
+LONGEST = 7200  # samples of a record that are used, the last ones
 POOLED = 3  # nights over which an estimate is pooled
-# several nights tell how the air around scatters from one to the next, pieces of one do not
+# several nights show how the ambient air scatters from one to the next; pieces of one night do not
 NIGHTS_FLOORS, PIECES_FLOORS = baseline.Floors(0.03, 0.25), baseline.Floors(0.2, 2.0)
 # mean offset of the champion's own nights, in units of drift.offset_degC, up to which they count as a
 # closed loop at the references
@@ -34,15 +36,15 @@ SETTLED = 5.0
 FOLDS = 4  # models that are identified without some of the champion's nights
 # no machine changes by more within a night: then the record is in doubt
 MOST_GAIN_PERCENT, MOST_OFFSET_DEGC = 80.0, 50.0
-FELL_PERCENT = -60.0  # a heater that gives so much less looks like commands that are written too large
+FELL_PERCENT = -60.0  # a heater whose gain fell by more looks like commands that are written too large
 ROOM_DEGC, COLDEST_DEGC, HOTTEST_DEGC = 20.0, -30.0, 60.0  # of the champion's nights; of any room
-UNEXPLAINED = 3.0  # by so much more than an honest record may leave, a record leaves what no cause explains
-LIKELY, WORTH_NAMING = 4.0, 1.5  # times that a record fits better with a mistake undone
+UNEXPLAINED = 3.0  # times the error allowed for an honest record, above which no cause explains the record
+LIKELY, WORTH_NAMING = 4.0, 1.5  # factors by which a record fits better once a mistake is undone
 SHORTEST = 60  # samples of a stretch at one set-point that can settle
-PARTS = 4  # of a record, whose scatter tells how well its closed-loop figures are known
+PARTS = 4  # of a record; their scatter gives the accuracy of its closed-loop figures
 
 
-# by kind of cause: its limit in nightly.drift, and what is said of it; `size` is in the unit of the limit
+# by kind of cause: its limit in nightly.drift, and its sentence; `size` is in the unit of the limit
 SENTENCES = {
     "gain": ("parameter_percent", "the gain from {name} has changed by {size:+.1f} %"),
     "time constant": (
@@ -63,10 +65,10 @@ SENTENCES = {
 
 
 class ProductionReference(NamedTuple):
-    """What the champion's own recordings said of its model, and their closed-loop figures. Of the sensors:
-    `steps` (p,) in °C, and `reversals` (p,), the share of samples at which each turns back. `digest` is that
-    of reference.json, by which the memory of the nights knows it again. Then the machine as it is declared,
-    and the limits that changes are held against."""
+    """The champion's model with the results of its own recordings (`own`), and their closed-loop figures
+    (`loop`). For the sensors: `steps` (p,) in °C, and `reversals` (p,), the fraction of samples at which each
+    turns back. `digest`: of reference.json, by which the memory of the runs recognises it. `plant`: the
+    machine as declared; `limits`: for changes."""
 
     machine: ProductionModel
     own: Baseline
@@ -79,13 +81,13 @@ class ProductionReference(NamedTuple):
 
     @property
     def signals(self) -> dict[str, list[str]]:
-        """Names of inputs and outputs."""
+        """Returns the names of inputs and outputs."""
         return {side: [one.name for one in getattr(self.plant, side)] for side in ("inputs", "outputs")}
 
 
 class RecordingChange(NamedTuple):
-    """A change of one recording: kind and channel for a machine to read, words for a person; size in the unit
-    of its limit, the standard deviation of the size, and the limit."""
+    """A change found in one recording: `kind` and `channel` for a machine to read, `words` for a person;
+    `size` in the unit of its limit, the standard deviation of the size, and the limit."""
 
     kind: str
     channel: str
@@ -104,8 +106,9 @@ class RecordingChange(NamedTuple):
 
 
 def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict[str, Any] | None:
-    """champion/<loop>/reference.json of the model below `folder`, from the loop's recordings, or `only` those
-    named; None where they are none, or too short."""
+    """Returns the content of champion/<loop>/reference.json for the model below `folder`, from the loop's
+    recordings, or only from those named in `only`. Returns None if there are none, or if they are too
+    short."""
     machine = recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet")
     records = judge.read_records(Path(loop.recordings), machine, {})
     named = [path.removeprefix(f"{loop.recordings}/") for path in only] or sorted(records)
@@ -121,7 +124,7 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
     samples = int(np.median([sum(len(u) for u, _ in night) for night in nights])) if nights else 0
     try:
         production = ProductionModel(judge.identified(folder), samples)
-        # of recordings that are named, the champion's model is not made
+        # the champion's model was not made from recordings that are named
         without = None if only else _without_each(machine, nights, samples)
         own = baseline.measured(production, nights, floors, without)
     except ValueError:
@@ -138,9 +141,9 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
 
 
 def _without_each(machine: Plant, nights: Sequence[Segments], samples: int) -> list[ProductionModel]:
-    """For each night a model that was identified without it, as a new night's is: what such a model gets
-    wrong of it is no change of the machine. Nights share FOLDS models. Raises ValueError where the others do
-    not determine one."""
+    """Identifies for each night a model without it, because a new night is not in the champion's model
+    either. Errors of such a model on its night are no change of the machine. Nights share FOLDS models.
+    Raises ValueError if the other nights do not determine a model."""
     own = params.read()["identify_plant"]
     settings = model_choice.Settings(offset=own["offset"], max_order=own["max_order"])
     names, folds = [signal.name for signal in machine.inputs], min(FOLDS, len(nights))
@@ -156,7 +159,7 @@ def _without_each(machine: Plant, nights: Sequence[Segments], samples: int) -> l
 
 
 def read_reference(folder: Path, machine: Plant, limits: DriftLimits) -> ProductionReference | None:
-    """That of a champion's folder; None if it has none that this version reads."""
+    """Returns the reference in a champion's folder; None if there is none that this version reads."""
     path = folder / REFERENCE
     fields = artifacts.read_json(path) if path.exists() else {}
     if fields.get("version") not in (baseline.BEFORE, baseline.VERSION):
@@ -176,7 +179,7 @@ def read_reference(folder: Path, machine: Plant, limits: DriftLimits) -> Product
 
 
 def _last(segments: Segments) -> Segments:
-    """The last LONGEST samples of a record: they tell enough, and a night has other things to do."""
+    """Returns the last LONGEST samples of a record, which are enough and limit the time of a run."""
     ends = np.cumsum([len(u) for u, _ in segments])
     skips = [
         max(int(ends[-1] - LONGEST - (end - len(u))), 0) for end, (u, _) in zip(ends, segments, strict=True)
@@ -196,9 +199,9 @@ def look(
     champion: Path | None,
     memory: Memory,
 ) -> dict[str, Any]:
-    """Adds to `findings` what the new recordings below `folder` say of the loop's machine, held against those
-    of its champion; what the next night must remember of this one (see `Memory.recent`). A recording that
-    cannot be read, or is not what it says, is set aside."""
+    """Compares the new recordings below `folder` with those of the loop's champion, and adds the results to
+    `findings`. Returns what the next run must remember of this one (see `Memory.recent`). Sets aside a
+    recording that cannot be read or has a recording mistake."""
     recent = memory.recent.get(loop, {})
     if not Path(folder).is_dir():
         return recent
@@ -234,9 +237,9 @@ def look(
 def _stand_still(
     findings: NightDrift, loop: str, path: str, record: dict[str, np.ndarray], production: ProductionReference
 ) -> bool:
-    """Whether a sensor gives no number or stands still in a recording: then that is an alarm, the recording
-    is set aside, and nothing else is asked of it. Readings in °F or K are out of limits as well: if they are
-    within them with that undone, and fit the model, it is a mistake of the record and no alarm."""
+    """Returns whether a sensor of a recording gives no number or stands still. This is an alarm; the
+    recording is set aside and not examined further. Readings in °F or K are out of limits, too: if they are
+    within limits and fit the model once converted, this is a recording mistake and no alarm."""
     readings = _last(judge.segments(record, production.plant, masked=False))
     noise = np.exp(production.own.noise.mean(axis=0) / 2)
 
@@ -280,7 +283,8 @@ def _hold_against(
     nights: list[dict[str, list[float]]],
     pending: Sequence[str],
 ) -> None:
-    """Adds what one recording says of the machine to the findings; its changes join those of `nights`."""
+    """Compares one recording with the champion's, and adds the results to the findings and its changes to
+    `nights`."""
     machine, limits = production.plant, production.limits
     segments, closed_loop = _last(judge.segments(record, machine)), _closed_loop(record, machine)
     if not segments:
@@ -317,9 +321,9 @@ def _hold_against(
 
 
 def past_limit(estimates: Sequence[Sequence[float] | None], limit: float) -> float:
-    """How surely a change is past its limit, in sigmas: the largest of the last nights' evidence together, of
-    the last one, the last two, and so on while they agree in sign (Page's test; Page 1954). `estimates` are
-    [size, standard deviation] of each night, None if it named nothing."""
+    """Returns how far a change is past its limit, in sigmas. This is the largest combined evidence of the
+    last night, the last two, and so on, while they agree in sign (Page's test; Page 1954). `estimates`:
+    [size, standard deviation] of each night, None if the change was not named."""
     agreeing: list[Sequence[float]] = []
     for estimate in reversed(estimates):
         if estimate is None or (agreeing and estimate[0] * agreeing[0][0] < 0):
@@ -333,9 +337,9 @@ def past_limit(estimates: Sequence[Sequence[float] | None], limit: float) -> flo
 
 
 class RecordingDrift(NamedTuple):
-    """Of one recording: figures for the page, what changed, and what the closed loop does otherwise beyond
-    what those changes and the air around bring. `misfit` is the mean squared error that is left, in that of
-    the champion's own."""
+    """Results of one recording: `figures` for the page; `changes`; and `loop`, changes of the closed loop
+    beyond the effect of those changes and of the ambient air. `misfit`: the remaining mean squared error, in
+    units of that of the champion's own recordings."""
 
     figures: dict[str, Any]
     changes: list[RecordingChange]
@@ -380,9 +384,9 @@ def _measure(
 def _find_doubt(
     measured: RecordingDrift, segments: Segments, production: ProductionReference
 ) -> tuple[str, bool] | None:
-    """Why a record may not be of this machine, in words, and whether it is set aside; None if the causes that
-    were named can be, and explain the record. A heater that is dead looks like commands that are written too
-    large: a gain that fell is told with the mistake beside it."""
+    """Returns why a record may not come from this machine, in words, and whether it is set aside. Returns
+    None if the named causes are possible and explain the record. A dead heater looks like commands written
+    too large, so if a gain fell, it is reported together with the possible mistake."""
     impossible = [change for change in measured.changes if cannot_be(change.kind, change.size)]
     unexplained = measured.misfit > UNEXPLAINED * mistakes.honest(production.own)
     if not impossible and not unexplained and len(measured.changes) < drift.MOST:
@@ -399,7 +403,7 @@ def _find_doubt(
 
 
 def cannot_be(kind: str, size: float) -> bool:
-    """Whether no machine changes so within a night."""
+    """Returns whether no machine changes by this much within a night."""
     kind = kind.split(" or ")[0]
     if kind == "ambient":
         return not COLDEST_DEGC < ROOM_DEGC + size < HOTTEST_DEGC
@@ -418,7 +422,8 @@ def _limit(fit: CauseFit, production: ProductionReference) -> float:
 
 
 def _size(fit: CauseFit, production: ProductionReference, segments: Segments = ()) -> tuple[float, float]:
-    """A fit and its standard deviation in the unit of its limit: percent, s, °C, or percent of the record."""
+    """Returns the size of a change and its standard deviation in the unit of its limit: percent, s, °C, or
+    percent of the record."""
     cause, value, deviation = fit.cause, fit.value, fit.deviation
     if cause.kind == "saturation":
         least, at, most = (drift.above(segments, cause.channel, value + k * deviation) for k in (1, 0, -1))
@@ -448,8 +453,8 @@ def _say(production: ProductionReference, fit: CauseFit, segments: Segments) -> 
 
 
 def _join_rivals(rivals: Sequence[RecordingChange]) -> RecordingChange:
-    """Rivals, the likeliest first, as one: if one of them is far past its own limit and the likeliest is not,
-    it is said first."""
+    """Joins rival changes, the likeliest first, into one. If another rival is far past its own limit and the
+    likeliest is not, that rival comes first."""
     farthest = max(rivals, key=lambda one: abs(one.size) / one.limit)
     ahead = abs(farthest.size) >= AHEAD * farthest.limit and abs(rivals[0].size) < rivals[0].limit
     rivals = sorted(rivals, key=lambda one: ahead and one is not farthest)
@@ -471,8 +476,8 @@ def _say_air(production: ProductionReference, air: float) -> RecordingChange:
 def _compare_noise(
     record: DriftRecord, explained: Explanation, production: ProductionReference
 ) -> tuple[dict[str, dict[str, float]], list[RecordingChange]]:
-    """Noise of each output, and by how many degrees of its steady level it is off what the champion's nights
-    had; then the noises that have changed."""
+    """Returns for each output its noise and the deviation of its steady level in °C, compared with the
+    champion's nights; then the noises that have changed."""
     value, deviation = baseline.noise(drift.by_output(record, explained.left))
     noise = drift.shift(value, deviation, production.own.noise, production.own.noise_deviation)
     air, own = drift.levels(record, production.own.changes)
@@ -488,7 +493,7 @@ def _compare_noise(
         if abs(percent) > 0.5 * limit and abs(sigmas) >= drift.SURE:
             word = "grown" if percent > 0 else "fallen"
             words = f"the noise of {output} has {word} by {abs(percent):.0f} %"
-            # of a logarithm of a variance
+            # converted from the deviation of the logarithm of a variance
             deviation_percent = 50 * float(ratio[i] * noise.deviation[i])
             louder.append(RecordingChange("noise", output, words, percent, deviation_percent, limit))
     return figures, louder
@@ -497,8 +502,8 @@ def _compare_noise(
 def _tell_parameters(
     fits: Sequence[CauseFit], production: ProductionReference
 ) -> dict[str, dict[str, float]]:
-    """{cause: change in percent, half of its 90 % band, sigmas} of gains and time constants: what was named,
-    and what the others seem beside it."""
+    """Returns {cause: change in percent, half of its 90 % band, sigmas} for gains and time constants, both
+    the named causes and the estimates of the others."""
     figures = {}
     order = drift.causes(production.machine.plant)
     for fit in sorted(fits, key=lambda fit: order.index(fit.cause)):
@@ -511,8 +516,8 @@ def _tell_parameters(
 
 
 def _tell_least(fits: Sequence[CauseFit], production: ProductionReference) -> str:
-    """The smallest changes of a gain and of an offset that would have been an alarm tonight, of the signal
-    that is known least."""
+    """Returns, in words, the smallest changes of a gain and of an offset that would have raised an alarm in
+    this run, for the signal that is known least well."""
     words = []
     for article, kind, unit in (("a", "gain", "%"), ("an", "offset", "°C")):
         size, name = max(
@@ -531,10 +536,10 @@ def _tell_least(fits: Sequence[CauseFit], production: ProductionReference) -> st
 
 
 def _closed_loop(record: Mapping[str, np.ndarray], machine: Plant) -> dict[str, list[list[float]]]:
-    """Offset of each output from its set-point where it is settled in °C, root mean square of each input and
-    its share of samples at a limit, both in percent, and the settled set-points in °C: [figures, their
-    standard deviations], from PARTS of the record, which are longer than what a loop remembers. Empty where
-    nothing is settled."""
+    """Returns [figures, their standard deviations]: the offset of each output from its set-point, when
+    settled, in °C; the root mean square of each input, and its share of samples at a limit, both in percent;
+    and the settled set-points in °C. The deviations come from PARTS of the record, which are longer than the
+    loop's memory. Returns {} if nothing is settled."""
     u, y = np.split(
         np.column_stack([
             np.where(record[f"{s.name}_masked"], np.nan, record[s.name]).astype(float)
@@ -561,8 +566,9 @@ def _closed_loop(record: Mapping[str, np.ndarray], machine: Plant) -> dict[str, 
 
 
 def _settled(wanted: np.ndarray) -> np.ndarray:
-    """Where (T,) a loop has had time to reach its set-points (T, p): the last two thirds of a stretch of
-    SHORTEST samples or more in which none is changed. No set-point, or 0, is a heater that is off."""
+    """Returns at which samples (T,) a loop has had time to reach its set-points (T, p): the last two thirds
+    of each stretch of at least SHORTEST samples with constant set-points. No set-point, or 0, means that the
+    heater is off."""
     changes = np.flatnonzero((np.diff(wanted, axis=0) != 0).any(axis=1)) + 1
     stretches = np.split(np.arange(len(wanted)), changes)
     late = [one[len(one) // 3 :] for one in stretches if len(one) >= SHORTEST]
@@ -571,7 +577,8 @@ def _settled(wanted: np.ndarray) -> np.ndarray:
 
 
 def _mean(values: np.ndarray) -> list[list[float]]:
-    """Mean (k,) of values (T, k) that are there, and its standard deviation from the means of PARTS."""
+    """Returns the mean (k,) of the finite values (T, k), and its standard deviation from the means of
+    PARTS."""
     parts = np.ma.masked_invalid(values)
     means = np.ma.stack([part.mean(axis=0) for part in np.array_split(parts, PARTS)])
     deviation = means.std(axis=0, ddof=1) / np.sqrt(PARTS)
@@ -585,10 +592,9 @@ def _compare_loop(
     *,
     unchanged: bool,
 ) -> tuple[dict[str, dict[str, float]], list[CameraChange], str]:
-    """Offset, effort and share at limits against the champion's own nights: figures by name, what has
-    changed, and why it was not asked, if it was not. `effect` (p,) are the °C that the changes of the machine
-    and the air around bring: what they explain is not counted again; `unchanged`: the machine is as it
-    was."""
+    """Compares offset, effort and share at limits with the champion's own nights. Returns figures by name,
+    what has changed, and, if there was no comparison, why. `effect` (p,): °C that the machine's changes and
+    the ambient air explain; this part is not counted again. `unchanged`: the machine has not changed."""
     limits, nights = production.limits, [night for night in production.loop if night]
     if not now or not nights:
         return {}, [], "no stretch is settled at a set-point"
@@ -613,7 +619,7 @@ def _compare_loop(
     }  # fmt: skip
     figures, causes = {}, []
     for key, (sentence, least, allowed) in asked.items():
-        if elsewhere and key != "offset_degC":  # other set-points take other duties
+        if elsewhere and key != "offset_degC":  # other set-points need other inputs
             continue
         moved = _shift_loop(now[key], usual[key], least)
         for k, name in enumerate(production.signals["outputs" if key == "offset_degC" else "inputs"]):
@@ -628,11 +634,11 @@ def _compare_loop(
 
 
 def _shift_loop(now: list[list[float]], usual: np.ndarray, least: float) -> drift.Shift:
-    """Of one figure against those of the champion's nights (nights, 2, signals)."""
-    # a figure counts as known to a sixth of what matters at best, so that
-    # nights that agree by chance make no alarm of a trifle
+    """Compares one figure with those of the champion's nights (nights, 2, signals)."""
+    # the assumed deviation of a figure is at least a sixth of its limit, so that
+    # nights that agree by chance do not turn a small change into an alarm
     own = np.maximum([*usual[:, 1], now[1]], least / 6)
-    # a few parts of one night say little of how well a mean is known: those of all nights say it
-    # together; a short or restless night is known less well
+    # a few parts of one night give a poor estimate of a mean's deviation, so those of all nights are
+    # pooled; a short or restless night keeps its larger one
     pooled = np.maximum(np.sqrt((own**2).mean(axis=0)), own[-1])
     return drift.shift(np.array(now[0]), pooled, usual[:, 0], own[:-1], freedom=(PARTS - 1) * len(own))

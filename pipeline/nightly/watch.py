@@ -1,5 +1,5 @@
-"""Who is woken, and when nobody ran: the alarm's JSON file, its command and webhook, the heartbeat, and the
-age of the last success."""
+"""Sends alarms, also if no run took place: the alarm's JSON file, its command and webhook, the heartbeat, and
+the age of the last success."""
 
 import contextlib
 import datetime
@@ -25,12 +25,12 @@ from pipeline.nightly.settings import Nightly
 from pipeline.store import artifacts, params
 
 ALARM = STATE / "alarm.json"
-# a try at a server, the pause before the second, and the alarm's command: all that waking may take is bounded
+# time limits: one request to a server, the pause before the second, and the alarm's command
 ASKED_S, PAUSE_S, COMMAND_S = 20.0, 2.0, 60.0
 
 
 class Routes(NamedTuple):
-    """How somebody is told: the alarm's command and webhook, and the heartbeat of nights that went well."""
+    """How people are notified: the alarm's command and webhook, and the heartbeat URL of successful runs."""
 
     alarm: str = ""
     webhook: str = ""
@@ -38,8 +38,8 @@ class Routes(NamedTuple):
 
 
 def find_routes(settings: Nightly | None) -> Routes:
-    """Those of the environment, so that no secret stands in a file; otherwise those of the parameters, or if
-    these are broken, of the last commit whose parameters can be read."""
+    """Returns the routes from the environment, so that no secret is in a file. Otherwise returns those of the
+    parameters, or, if these are broken, of the last commit with readable parameters."""
     written = settings.model_dump() if settings else _read_committed()
     return Routes(
         *(os.environ.get(f"BEADLINE_{key.upper()}") or str(written.get(key, "")) for key in Routes._fields)
@@ -55,7 +55,8 @@ def _read_committed() -> dict[str, Any]:
 
 
 def hide_secrets(settings: Nightly) -> Nightly:
-    """The settings as a page may show them: of a URL the server, of a command its first word."""
+    """Returns the settings as a page may show them: only the server of a URL, only the first word of a
+    command."""
     routes = find_routes(settings)
     public = {
         "webhook": _server(routes.webhook),
@@ -66,7 +67,7 @@ def hide_secrets(settings: Nightly) -> Nightly:
 
 
 def _server(url: str) -> str:
-    """Of a URL what is no secret; empty where there is none."""
+    """Returns the part of a URL that is no secret; "" if there is no URL."""
     try:
         parts = urllib.parse.urlsplit(url)
         return f"{parts.scheme}://{parts.hostname}" if parts.hostname else "a URL" if url else ""
@@ -83,8 +84,8 @@ def stamp(now: datetime.datetime) -> str:
 
 
 def find_overdue(now: datetime.datetime, success: str, watch_h: float) -> str:
-    """Why somebody should look: the last success is older than `watch_h` hours,
-    or lies in the future; empty where all is well."""
+    """Returns a warning if the last success is older than `watch_h` hours, or lies in the future; "" if all
+    is well."""
     if not success:
         return "no night has ever succeeded; run ./run beadline nightly, and look at its schedule"
     age_h = (now - datetime.datetime.fromisoformat(success)).total_seconds() / 3600
@@ -105,8 +106,8 @@ def find_overdue(now: datetime.datetime, success: str, watch_h: float) -> str:
 
 
 def wake(kind: str, reasons: Sequence[str], details: Mapping[str, Any], routes: Routes) -> list[str]:
-    """Writes the alarm, runs the command with its path, posts it to the webhook; what went wrong on the way,
-    as sentences, for an alarm that fails must not hide the night."""
+    """Writes the alarm file, runs the command with its path, and posts it to the webhook. Returns what went
+    wrong, as sentences, because a failing alarm must not hide the run."""
     chat = escape_for_chat(f"beadline: {details.get('night', 'nightly')}: {kind}: {'; '.join(reasons)}")
     alarm = {"schema": "alarm", "version": 1, "kind": kind, "text": chat, "reasons": list(reasons), **details}
     text = json.dumps(alarm, indent=2, ensure_ascii=False, default=str).encode("utf-8", "replace")
@@ -122,26 +123,27 @@ def wake(kind: str, reasons: Sequence[str], details: Mapping[str, Any], routes: 
     return troubles
 
 
-# signs that are markup in Slack or Mattermost, and others that look like them and are none
+# characters that are markup in Slack or Mattermost, and replacements that look alike and are none
 PLAIN = {"&": "&amp;", "<": "&lt;", ">": "&gt;", "*": "\u2217", "`": "\u02cb", "~": "\u223c", "@": "@\u200b"}
 
 
 def escape_for_chat(text: str) -> str:
-    """A text in which Slack and Mattermost find no tag, mention, link, picture or emphasis: names of files
-    are anybody's. An underscore is markup at the edge of a word alone, so that shift_12 stays what it is."""
+    """Returns a text in which Slack and Mattermost find no tag, mention, link, picture or emphasis, because
+    file names may contain anything. An underscore is markup only at the edge of a word, so shift_12 is
+    kept."""
     text = re.sub(r"(?<![^\W_])_|_(?![^\W_])", "\u02cd", text.translate(str.maketrans(PLAIN)))
     return text.replace("](", "]\u200b(")
 
 
 def beat(routes: Routes) -> list[str]:
-    """Tells the heartbeat's URL that a night went well; what went wrong, as sentences."""
+    """Tells the heartbeat's URL that a run succeeded. Returns what went wrong, as sentences."""
     trouble = _ask(routes.heartbeat) if routes.heartbeat else ""
     return [f"nightly.heartbeat: {_server(routes.heartbeat)}: {trouble}"] if trouble else []
 
 
 def _command(command: str, kind: str, alarm: bytes) -> str:
-    """Why the command did not do its work, empty if it did. It reads the alarm from its input too, which
-    needs no file."""
+    """Returns why the command failed; "" if it did not. The command also gets the alarm on standard input,
+    which needs no file."""
     with tempfile.TemporaryFile() as printed:
         try:
             child = subprocess.Popen(
@@ -165,7 +167,7 @@ def _command(command: str, kind: str, alarm: bytes) -> str:
 
 
 def _ask(url: str, body: bytes | None = None) -> str:
-    """Asks a server, once more after a pause if it fails; why it failed, empty if it did not."""
+    """Sends a request, and once more after a pause if it fails. Returns why it failed, "" if it did not."""
     if not (trouble := _try(url, body)):
         return ""
     time.sleep(PAUSE_S)
@@ -173,8 +175,8 @@ def _ask(url: str, body: bytes | None = None) -> str:
 
 
 def _try(url: str, body: bytes | None) -> str:
-    """One try, within ASKED_S: in a thread, for a server's name or its headers byte by byte take as long as
-    they like."""
+    """Sends one request, within ASKED_S. It runs in a thread, because resolving the server's name or slow
+    headers can take any time."""
     troubles = [f"no answer within {ASKED_S:g} s"]
 
     def ask() -> None:
@@ -182,12 +184,12 @@ def _try(url: str, body: bytes | None) -> str:
             headers = {"User-Agent": "beadline"} | ({"Content-Type": "application/json"} if body else {})
             request = urllib.request.Request(url, body, headers)
             if request.type not in ("http", "https"):
-                raise ValueError(request.type)  # a file of this machine wakes nobody
+                raise ValueError(request.type)  # a file: URL notifies nobody
             with urllib.request.urlopen(request, timeout=ASKED_S) as answer:
-                # on the way to another URL the alarm is lost
+                # on a redirect to another URL the alarm's body is lost
                 sent_on = body is not None and answer.url != request.full_url
             troubles[:] = ["it sends on to another URL; write that one"] if sent_on else []
-        except Exception as error:  # whatever it is, it must not hide the night, nor tell the URL
+        except Exception as error:  # no error may hide the run, or reveal the URL
             troubles[:] = [_refusal(error)]
 
     thread = threading.Thread(target=ask, daemon=True)
@@ -197,7 +199,7 @@ def _try(url: str, body: bytes | None) -> str:
 
 
 def _refusal(error: Exception) -> str:
-    """Why a server could not be asked, without its URL, which may hold a secret."""
+    """Returns why a request failed, without its URL, which may hold a secret."""
     if isinstance(error, urllib.error.HTTPError):
         return f"it answered with status {error.code}"
     reason = getattr(error, "reason", error)

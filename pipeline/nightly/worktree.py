@@ -1,5 +1,5 @@
-"""The throw-away copy in which a night works: a git worktree below .beadline, at the files as they lie in the
-project, with the recordings, DVC's cache and the memos of the project. Killed at any moment, it has changed
+"""The temporary copy in which a run works: a git worktree below .beadline, with the project's files as they
+are, its recordings, DVC's cache and its other caches. A run that is killed at any moment has changed
 nothing."""
 
 import contextlib
@@ -18,18 +18,18 @@ from pipeline.store import artifacts
 
 LOCK, COPY, OLD = STATE / "lock", STATE / "copy", STATE / "copy.old"
 LINKED = ("datasets/raw", "datasets/holdout")
-# a younger recording may still grow: it is copied as it is, and the next night finds it changed
+# a younger recording may still grow: it is copied as it is, and the next run finds it changed
 YOUNG_S = 600.0
-LOCKED_S = 10  # a git that works in the project is waited for so long
+LOCKED_S = 10  # how long to wait for a git that is running in the project
 
 
 class BusyError(ValueError):
-    """Another night is at work."""
+    """Another nightly run is in progress."""
 
 
 class Snapshot(NamedTuple):
-    """The commit of HEAD when a night began, and one of the tracked files as they lay in the project then;
-    the reference of the branch that was checked out, empty if there was none."""
+    """`head`: commit of HEAD when a run began; `files`: a commit of the tracked files as they were in the
+    project then; `branch`: reference of the branch that was checked out, empty if there was none."""
 
     head: str
     files: str
@@ -38,7 +38,8 @@ class Snapshot(NamedTuple):
 
 @contextlib.contextmanager
 def locked() -> Generator[None]:
-    """The night's lock; the kernel lets go if a process dies. Raises BusyError if another night has it."""
+    """Holds the run's lock; the kernel releases it if the process dies. Raises BusyError if another run holds
+    it, and ValueError if a file is in the place of a needed folder."""
     for folder, purpose in ((STATE, "in which nights are remembered"), (COPY, "in which a night works")):
         if folder.exists() and not folder.is_dir():
             raise ValueError(
@@ -63,8 +64,9 @@ def locked() -> Generator[None]:
 
 
 def take() -> Snapshot:
-    """Raises ValueError if the project is no repository of its own, a merge is half done in it, git has files
-    below a folder that is a link by now, or git's lock does not go."""
+    """Returns a snapshot of the project. Raises ValueError if the project is no repository of its own, a
+    merge in it is unfinished, git has files below a folder that is now a link, or git's lock is not
+    released."""
     head = git("rev-parse", "--verify", "-q", "HEAD", check=False)
     if not head or git("rev-parse", "--show-prefix"):
         raise ValueError(
@@ -92,8 +94,8 @@ def take() -> Snapshot:
 
 
 def make(snapshot: Snapshot, sources: Sequence[str]) -> None:
-    """The copy with all that a night needs: the files that git has or does not have yet, the files among
-    `sources` that it ignores; recordings; memos; the outs of the stages."""
+    """Makes the copy with everything that a run needs: the files that git has or does not have yet, those of
+    `sources` that git ignores, recordings, caches, and the outputs of the stages."""
     make_bare(snapshot)
     for place in map(Path, LINKED):
         if (COPY / place).is_symlink():
@@ -109,24 +111,24 @@ def make(snapshot: Snapshot, sources: Sequence[str]) -> None:
     memo.mkdir(parents=True, exist_ok=True)
     (COPY / memo).parent.mkdir(exist_ok=True)
     (COPY / memo).symlink_to(memo.resolve())
-    with contextlib.chdir(COPY), contextlib.suppress(ValueError):  # what no cache has is made anew
+    with contextlib.chdir(COPY), contextlib.suppress(ValueError):  # outputs in no cache are made again
         checkout([*read_stages("dvc.lock")], *map(str, Path("champion").glob("*.dvc")))
 
 
 def make_bare(snapshot: Snapshot) -> None:
-    """The copy with the files that git has, and DVC's settings."""
+    """Makes the copy with only the files that git has, and DVC's settings."""
     remove()
-    # hooks, as DVC's own, are of the checkout and not of the copy
+    # hooks, such as DVC's own, are for the checkout and not for the copy
     quiet = configure({"core.hooksPath": "/dev/null"})
-    # twice: also over one that was killed while git made it
+    # twice: also replaces a copy that was killed while git made it
     twice = ("--force", "--force")
     git("worktree", "add", "--quiet", "--detach", *twice, str(COPY), snapshot.files, env=quiet)
     _share_dvc()
 
 
 def checkout(stages: Sequence[str], *pointers: str) -> None:
-    """Brings the outs of these stages as dvc.lock has them, and those of these pointers. Raises ValueError
-    if one is in no cache."""
+    """Restores the outputs of these stages as in dvc.lock, and those of these pointers. Raises ValueError if
+    one is in no cache."""
     wired, locked_stages = read_stages("dvc.yaml"), read_stages("dvc.lock")
     known = [name for name in stages if name in wired and name in locked_stages]
     if known or pointers:
@@ -134,7 +136,7 @@ def checkout(stages: Sequence[str], *pointers: str) -> None:
 
 
 def _share_dvc() -> None:
-    """DVC works in the copy with the project's cache and remotes, whose paths are absolute here."""
+    """Lets DVC in the copy use the project's cache and remotes, with absolute paths."""
     from dvc.config import Config
 
     shared = Config(dvc_dir=str(Path(".dvc").resolve()))
@@ -147,7 +149,8 @@ def _share_dvc() -> None:
     with Config(dvc_dir=str((COPY / ".dvc").resolve())).edit("local") as settings:
         settings["cache"] = cache
         settings["remote"] = {name: dict(remote) for name, remote in shared["remote"].items()}
-    # by its age DVC names the folder in which it keeps what it has hashed: the same every night
+    # DVC names its folder of known hashes after the age of this file, so the age must be the same in every
+    # run
     btime = COPY / ".dvc/tmp/btime"
     btime.parent.mkdir(exist_ok=True)
     btime.touch()
@@ -155,10 +158,10 @@ def _share_dvc() -> None:
 
 
 def link(source: Path, target: Path, sources: Sequence[str] = ()) -> None:
-    """The tree of `source` made of hard links: DVC adds nothing below a folder that is a link itself. On
-    another disk a file is a link. What may still grow is copied as it is, and what is no file is left out. A
-    folder that is a link stays one, unless the night reads something below it, `sources`: what the night
-    moves there is then not the project's own file."""
+    """Reproduces the tree of `source` with hard links, because DVC adds nothing below a folder that is itself
+    a link. A file on another disk becomes a link. A file that may still grow is copied as it is; things that
+    are no files are left out. A folder that is a link remains one, unless the run reads something below it
+    (`sources`). Then what the run moves there is not the project's own file."""
     is_read = any(inputs.lies_in(name, [str(source)]) for name in sources)
     if source.is_dir() and source.is_symlink() and not is_read:
         target.symlink_to(source.resolve())
@@ -176,12 +179,12 @@ def link(source: Path, target: Path, sources: Sequence[str] = ()) -> None:
 
 
 def remove() -> None:
-    """Nothing is left of the copy. It is renamed first: a stage of a killed night that writes until it ends,
-    a moment later, does not write into the next copy."""
+    """Removes the copy. It is renamed first, so that a stage of a killed run that still writes for a moment
+    does not write into the next copy."""
     shutil.rmtree(OLD, ignore_errors=True)
     if COPY.is_symlink():
         COPY.unlink()
-    with contextlib.suppress(OSError):  # there is none, or no room: then it goes where it is
+    with contextlib.suppress(OSError):  # no copy, or no space: then it is removed in place
         COPY.rename(OLD)
     for place in (OLD, COPY):
         shutil.rmtree(place, ignore_errors=True)
@@ -189,7 +192,7 @@ def remove() -> None:
 
 
 def clear_killed() -> list[str]:
-    """Removes what a killed night left, and says so."""
+    """Removes what a killed run left, and returns a note if there was any."""
     if not COPY.exists():
         return []
     remove_stale_locks()

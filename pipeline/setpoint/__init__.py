@@ -6,7 +6,7 @@ are in percent of nominal, temperatures in °C; one step is one decision.
 >>> import jax, jax.numpy as jnp
 >>> from pipeline import setpoint
 
-The simulator of the paper names a bead under, good or over, and is right 70 % of the time (7).
+The paper's simulator classifies a bead as under, good or over, and is right 70 % of the time (7).
 
 >>> windows = setpoint.paper_windows()
 >>> starts = setpoint.starts(4, accuracy=0.7)

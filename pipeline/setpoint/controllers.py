@@ -1,8 +1,8 @@
-"""The table of controllers of the setpoint loop, in the order of simplicity: of two that are alike within
-noise the first is the default. Pages and verdicts read names and kinds here; importing this needs no jax.
+"""The table of controllers of the setpoint loop, simplest first. If two are equally good within noise, the
+first becomes the default. Pages and verdicts read names and kinds here; importing this needs no jax.
 
-A new controller is a file in pipeline/setpoint/agents/ with a function `build`, its row in CONTROLLERS, and a
-section of settings in `settings.Baselines` if it has any.
+To add a controller, write a file in pipeline/setpoint/agents/ with a function `build`, add its row to
+CONTROLLERS, and a section of settings to `settings.Baselines` if it has any.
 """
 
 from collections.abc import Sequence
@@ -40,7 +40,8 @@ KINDS: dict[str, Kind] = {row.name: row.kind for row in CONTROLLERS}
 
 
 def of_kind(kind: Kind) -> str:
-    """The first controller of a kind: the pair that answers "model-based or data-driven?" is one of each."""
+    """Returns the name of the first controller of a kind. The comparison "model-based or data-driven?" uses
+    one of each."""
     return next(row.name for row in CONTROLLERS if row.kind == kind)
 
 
@@ -50,8 +51,8 @@ def build_controllers(
     windows: "WindowTable | None",
     rows: Sequence[ControllerRow] = CONTROLLERS,
 ) -> dict[str, BuiltController]:
-    """The controllers of these rows by name, in the table's order. Numbers are float32, so that all
-    controllers of one kind are one program."""
+    """Returns the controllers of these rows by name, in the table's order. Numbers are float32, so that all
+    controllers of one kind share one compiled program."""
     import importlib
 
     import jax

@@ -1,11 +1,11 @@
-"""What another camera shows at flows that are known: a correction of the flow that a window shows, and how
-far it is to be trusted.
+"""Corrects the flow that another camera shows, from recordings at known flows, and estimates how accurate the
+corrected flow is.
 
-A few flows are held for a minute each. Their windows show other flows than were commanded: the camera looks
-from another side, the filament is of another colour. Log flow commanded by log flow shown is fitted by a
-line, or, where that foretells levels left out better, by straight pieces from level to level that never
-fall (isotonic regression; Barlow and others 1972). What remains is the spread: of windows about their level,
-and of levels about the curve.
+A few flows are commanded for a minute each. Their windows show other flows than commanded, because the camera
+looks from another side or the filament has another colour. The log of the commanded flow is fitted to the log
+of the shown flow by a line. If that predicts left-out levels better, it is fitted by straight pieces from
+level to level that never fall (isotonic regression; Barlow and others 1972). The residual is the spread: of
+windows about their level, and of levels about the curve.
 """
 
 from typing import NamedTuple
@@ -15,22 +15,22 @@ import numpy as np
 from pipeline.setpoint.simulation.recorded import WindowTable
 from pipeline.setpoint.vision.window_flow import class_probabilities
 
-# fewer windows say nothing of a level, fewer levels nothing of a curve
+# least number of levels for a curve, and of windows for a level
 LEAST_LEVELS, LEAST_WINDOWS = 3, 5
-# a camera sees flow where log flow shown rises by so much for each of log flow, at least, and where the
-# levels at the ends lie so many spreads apart
+# a camera sees flow if log flow shown rises at least this much per unit of log flow, and if the first and
+# last level lie at least this many spreads apart
 LEAST_SLOPE, LEAST_APART = 0.2, 3.0
-# a level may lie below the one before by so many of its standard errors, and this of log flow
+# a level may lie below the one before by this many of its standard errors plus this much log flow
 DIPS, DIP = 2.0, 0.02
-# relative width that a segment adds to its beads, one deviation, before any level has shown it; and for how
-# many levels that counts
+# assumed deviation of the relative bead width between segments, before any level is known; and the number of
+# levels that this assumption weighs
 SEGMENT_STD, SEGMENT_LEVELS = 0.05, 3
 
 
 class Levels(NamedTuple):
-    """The correction: log(flow shown / 100 %) knots (k,), rising, and log(flow / 100 %) there (k,); beyond
-    the ends it goes on with `slope`, of log flow by log flow shown. spread is the relative standard deviation
-    of a window's corrected flow. `straight`: whether it is a line."""
+    """The correction. `log_seen` (k,): knots of log(flow shown / 100 %), rising; `log_flow` (k,): log(flow /
+    100 %) there. Beyond the ends it continues with `slope`, log flow over log flow shown. `spread`: relative
+    standard deviation of a window's corrected flow. `straight`: whether it is a line."""
 
     log_seen: np.ndarray
     log_flow: np.ndarray
@@ -40,16 +40,16 @@ class Levels(NamedTuple):
 
 
 class LevelWindows(NamedTuple):
-    """w windows: flow shown (w,) and commanded (w,), both in percent of nominal."""
+    """w windows: `seen` (w,) flow shown, `flow` (w,) flow commanded, both in percent of nominal."""
 
     seen: np.ndarray
     flow: np.ndarray
 
 
 def fit(windows: LevelWindows) -> Levels:
-    """The correction that the windows of a few levels ask for. Raises ValueError, one sentence, where they do
-    not suffice: fewer than LEAST_LEVELS levels, fewer than LEAST_WINDOWS windows of one, or a camera that
-    does not see flow."""
+    """Fits the correction to the windows of a few levels. Raises ValueError, in one sentence, if there are
+    fewer than LEAST_LEVELS levels, fewer than LEAST_WINDOWS windows at one of them, or if the camera does not
+    see flow."""
     flows, middle, error, within = _summaries(windows)
     x, y = np.log(flows / 100), middle
     dip = np.diff(y) + DIPS * np.hypot(error[1:], error[:-1]) + DIP
@@ -65,34 +65,37 @@ def fit(windows: LevelWindows) -> Levels:
     at, value = (_line if straight else _pieces)(y, x)
     slope = float(np.polyfit(y, x, 1)[0])
     levels = Levels(at, value, slope, 0.0, bool(straight))
-    # what a level misses a line by is its segment's doing; pieces meet each level, and show nothing of it
+    # a level's distance from a line is the effect of its segment; pieces go through each level and do not
+    # show it
     free = len(x) - 2 if straight else 0
     missed = float((np.log(corrected(levels, 100 * np.exp(y)) / flows) ** 2).sum()) if straight else 0.0
     segment = (missed + SEGMENT_LEVELS * (SEGMENT_STD * slope) ** 2) / (free + SEGMENT_LEVELS)
-    # of the next segment, and of those that the correction was fitted on
+    # variance of the next segment, and of those that the correction was fitted to
     own = segment * (1 + (2 / len(x) if straight else 1.0))
     return levels._replace(spread=float(np.sqrt((within * slope) ** 2 + own)))
 
 
 def corrected(levels: Levels, flow_seen: np.ndarray) -> np.ndarray:
-    """Flow in percent of nominal of what windows show, in percent, any shape."""
+    """Returns the corrected flow in percent of nominal for the flow that windows show, in percent, any
+    shape."""
     return 100 * np.exp(_along(levels.log_seen, levels.log_flow, levels.slope, np.log(flow_seen / 100)))
 
 
 def shown(levels: Levels, flow: np.ndarray) -> np.ndarray:
-    """What this camera shows at a flow, both in percent: where a class's border lies for it."""
+    """Returns the flow that this camera shows at a true flow, both in percent. It gives a class's border as
+    this camera shows it."""
     return 100 * np.exp(_along(levels.log_flow, levels.log_seen, 1 / levels.slope, np.log(flow / 100)))
 
 
 def probabilities(levels: Levels, flow: np.ndarray) -> np.ndarray:
-    """(n, 3) shares of under, good, over of windows with corrected flows (n,) in percent."""
+    """Returns the shares of under, good and over (n, 3) of windows with corrected flows (n,) in percent."""
     return class_probabilities(np.log(flow / 100), np.full(len(flow), levels.spread))
 
 
 def table(levels: Levels, windows: LevelWindows, flow_edges: np.ndarray) -> WindowTable:
-    """What a controller learns from in place of the classifier's own windows: in the middle of each bin of
-    flow_edges (bins + 1,) in percent, each window errs as it did at its own flow, in log flow. Each level is
-    a segment."""
+    """Returns a table for training controllers, in place of the classifier's own windows. In the middle of
+    each bin of flow_edges (bins + 1,) in percent, each window has the error in log flow that it had at its
+    own flow. Each level is a segment."""
     error = np.log(corrected(levels, windows.seen) / windows.flow)
     _, segment = np.unique(windows.flow, return_inverse=True)
     middles = np.sqrt(flow_edges[:-1] * flow_edges[1:])
@@ -113,8 +116,9 @@ def table(levels: Levels, windows: LevelWindows, flow_edges: np.ndarray) -> Wind
 
 
 def _summaries(windows: LevelWindows) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Flows (k,) commanded, rising; the median of log(flow shown / 100 %) (k,) and its standard error; the
-    standard deviation of windows about their level, the same for all."""
+    """Returns the commanded flows (k,), rising; the median of log(flow shown / 100 %) (k,) and its standard
+    error (k,); and the standard deviation of windows about their level, one value for all. Raises ValueError
+    if there are too few levels or windows."""
     number = np.isfinite(windows.seen) & (windows.seen > 0)
     flows, count = np.unique(windows.flow, return_counts=True)
     usable = np.array([np.sum(number & (windows.flow == flow)) for flow in flows])
@@ -133,7 +137,7 @@ def _summaries(windows: LevelWindows) -> tuple[np.ndarray, np.ndarray, np.ndarra
         )
     logs = [np.log(windows.seen[number & (windows.flow == flow)] / 100) for flow in flows]
     middle = np.array([np.median(values) for values in logs])
-    # 1.4826: of a normal law, deviation by median distance; half of a level's windows may be mistaken
+    # 1.4826: deviation over median distance of a normal law; up to half of a level's windows may be wrong
     deviation = np.array(
         [1.4826 * np.median(np.abs(values - m)) for values, m in zip(logs, middle, strict=True)]
     )
@@ -142,14 +146,14 @@ def _summaries(windows: LevelWindows) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two points of the line through (x, y)."""
+    """Returns two points of the line through (x, y)."""
     ends = np.array([x.min(), x.max()])
     return ends, np.polyval(np.polyfit(x, y, 1), ends)
 
 
 def _pieces(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Knots of straight pieces that rise: neighbours that fall are pooled (isotonic regression), each pool at
-    its middle."""
+    """Returns the knots of rising straight pieces. Neighbours that fall are pooled (isotonic regression),
+    each pool at its mean."""
     order = np.argsort(x, kind="stable")
     pools = [[x[i], y[i], 1.0] for i in order]
     i = 0
@@ -167,7 +171,8 @@ def _pieces(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _left_out(x: np.ndarray, y: np.ndarray, kind) -> float:
-    """Mean squared miss, in log flow, of each level between the ends, foretold from the others."""
+    """Returns the mean squared error, in log flow, of each level between the ends, predicted from the
+    others."""
     misses = []
     for i in range(1, len(x) - 1):
         rest = np.arange(len(x)) != i
@@ -178,7 +183,7 @@ def _left_out(x: np.ndarray, y: np.ndarray, kind) -> float:
 
 
 def _along(at: np.ndarray, value: np.ndarray, slope: float, x: np.ndarray) -> np.ndarray:
-    """Linear between the knots, beyond them with `slope`."""
+    """Interpolates linearly between the knots, and continues with `slope` beyond them."""
     x = np.asarray(x, float)
     inside = np.interp(x, at, value)
     return inside + slope * (np.minimum(x - at[0], 0) + np.maximum(x - at[-1], 0))

@@ -1,5 +1,5 @@
-"""The values of Li and Pattinson 2025: the goal, the shaping of its reward, the moves and the simulator.
-Plain numbers, so that a page can name them without a simulator."""
+"""Values of Li and Pattinson 2025: the target, the shaping of the reward, the moves and the simulator. They
+are plain numbers, so that a page can use them without a simulator."""
 
 import math
 

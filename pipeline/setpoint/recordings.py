@@ -1,6 +1,5 @@
-"""Recordings of nozzle frames as this loop reads them: the options of recordings/nozzle_frames.py by section
-`train_classifier`, and the front end, which takes from a memo what it made of the same frames by the same
-code."""
+"""Reads recordings of nozzle frames for this loop: the options of recordings/nozzle_frames.py from section
+`train_classifier`, and the front end with its cache of results for the same frames and code."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -22,7 +21,7 @@ from pipeline.store.tables import FLOAT, NONE, TEXT, Column, Schema, bytes_of
 
 MEMO = Path("datasets/memo/train_classifier")
 HERE = Path(__file__).parents[1]
-# the code that decides what an entry of the memo holds
+# the code that determines the content of a cache entry
 CODE = (
     "setpoint/recordings.py", "setpoint/frames/front_end.py", "setpoint/frames/key_area.py",
     "setpoint/frames/travel.py", "setpoint/frames/familiar.py", "recordings/images.py",
@@ -56,7 +55,7 @@ KEY_AREAS = Schema(
 def read_options(
     settings: TrainClassifier, material: PrintedMaterial = PLA, memo: Path = MEMO
 ) -> ReadOptions:
-    """As section `train_classifier` says, of a material."""
+    """Returns the reading options that section `train_classifier` sets, for a material."""
     mapping = {name: (m.source, m.unit, m.scale, m.offset) for name, m in settings.topics.mapping.items()}
     topics = Topics(settings.topics.image, settings.topics.time, mapping)
     stated = settings.constants.hotend
@@ -72,7 +71,8 @@ def read_options(
 def read_frames(
     folder: Path, settings: TrainClassifier, execution: Execution, material: PrintedMaterial = PLA
 ) -> tuple[NozzleFrames, LabelledFrames, np.ndarray]:
-    """All frames of a user's folder (n); those with a known class and temperature; which these are (n,)."""
+    """Reads all frames of a user's folder (n). Returns them; those with a known class and temperature; and
+    which these are (n,)."""
     frames = nozzle_frames.read_folder(folder, read_options(settings, material), execution)
     nozzle_frames.check(folder, frames)
     usable = (frames.label >= 0) & np.isfinite(frames.temperature)
@@ -82,7 +82,7 @@ def read_frames(
 
 
 class FrontEnd(NamedTuple):
-    """front_end.py with the least score of a line in gray levels, and the folder of its memo."""
+    """front_end.py with the least score of a line in gray levels, and the folder of its cache."""
 
     least_score: float
     memo: Path
@@ -97,8 +97,8 @@ class FrontEnd(NamedTuple):
         return front_end.find_key_areas(frames, tips, directions_deg, least_score=self.least_score)
 
     def remember(self, what: tuple[Any, ...], count: int, find: Callable[[], FrameKeyAreas]) -> FrameKeyAreas:
-        """find() of `count` frames, or what it gave of the same `what` before. An entry is named by the hash
-        of all that decides what it holds."""
+        """Returns find() of `count` frames, or the cached result for the same `what`. A cache entry is named
+        by the hash of everything that determines its content."""
         code = [artifacts.sha256(HERE / name) for name in CODE]
         entry = self.memo / f"{joblib.hash((what, self.least_score, code))}.parquet"
         areas = read_memo(entry, count)
@@ -122,7 +122,8 @@ def write_memo(entry: Path, areas: FrameKeyAreas) -> None:
 
 
 def read_memo(entry: Path, count: int) -> FrameKeyAreas | None:
-    """An entry of so many frames that is whole, which the checksums of its pages tell."""
+    """Returns a cache entry for `count` frames; None if it does not exist, is damaged (checksums of its
+    pages), or has another number of frames."""
     try:
         table = artifacts.read_table(entry, KEY_AREAS)
     except ValueError:

@@ -9,7 +9,7 @@ from pipeline.store.params import Mapped, Section
 if TYPE_CHECKING:
     from pipeline.setpoint.material import PrintedMaterial
 
-# as far as pixels.py looks for the nozzle's tip, in px: a number of its own, since that module imports much
+# how far pixels.py searches for the nozzle's tip, in px; repeated here, since that module imports much
 REACH_PX = 30
 
 
@@ -18,7 +18,7 @@ Percent = Annotated[float, Field(ge=1, le=1000)]
 
 
 class SetpointMaterial(Section):
-    """Section `setpoint_material`: what is printed (material.Material)."""
+    """Section `setpoint_material`: the printed material (material.PrintedMaterial)."""
 
     best_temperature_degC: float = Field(ge=100, le=500)
     temperature_range_degC: tuple[Degrees, Degrees]
@@ -57,7 +57,7 @@ class Counts(Section):
 
 
 class Recipe(Section):
-    """How a network of one size is trained."""
+    """Training settings for a network of one size."""
 
     epochs: int = Field(ge=1, le=10_000)
     cycle_epochs: int = Field(ge=1, le=10_000)
@@ -71,7 +71,7 @@ class Recipe(Section):
 
 
 class RecordedTopics(Section):
-    """Topics of a user's MCAP recordings, as nozzle_frames.Topics says."""
+    """Topics of a user's MCAP recordings, as in nozzle_frames.Topics."""
 
     image: str = Field(max_length=300)
     time: str = Field(max_length=300)
@@ -79,7 +79,7 @@ class RecordedTopics(Section):
 
 
 class Constants(Section):
-    """What a folder's CSV files do not say because it never changed: the nozzle's temperature in degC."""
+    """Values missing in a folder's CSV files because they never changed: the nozzle's temperature in degC."""
 
     hotend: float | None = Field(ge=0, le=600)
 
@@ -104,7 +104,7 @@ class TrainClassifier(Section):
 
 
 class FlowFilterSettings(Section):
-    """What agents/flow_filter.py declares: probabilities a decision, costs in percent of flow error."""
+    """Parameters of agents/flow_filter.py: probabilities for one decision, costs in percent of flow error."""
 
     gains: list[Annotated[float, Field(gt=0, le=10)]] = Field(min_length=1, max_length=20)
     biases: int = Field(ge=1, le=51)
@@ -126,15 +126,15 @@ class SequentialTestSettings(Section):
 
 
 class Baselines(Section):
-    """Settings of the controllers without learning, declared or tuned on segments that nothing is judged
-    on."""
+    """Settings of the controllers without learning. They are declared, or tuned on segments that are not used
+    in tests."""
 
     sequential_test: SequentialTestSettings
     flow_filter: FlowFilterSettings
 
 
 class Pixels(Section):
-    """The closed loop through rendered frames; none with 0 starts."""
+    """The closed loop through rendered frames; it is not simulated if `starts` is 0."""
 
     starts: int = Field(ge=0, le=21)
     runs: int = Field(ge=1, le=1000)
@@ -154,8 +154,8 @@ class Pixels(Section):
 
 
 class MostHarmed(Section):
-    """Of runs from good starts those that may leave +-25 %, or a controller is no candidate: from 100 %, and
-    from 92.5 to 107.5 %."""
+    """Percentages of runs from good starts that may leave +-25 %: from 100 %, and from 92.5 to 107.5 %. A
+    controller above a limit is no candidate."""
 
     perfect_percent: float = Field(ge=0, le=100)
     in_band_percent: float = Field(ge=0, le=100)
@@ -163,7 +163,7 @@ class MostHarmed(Section):
 
 class EvaluateSetpoint(Section):
     """Section `evaluate_setpoint`: `runs` from each of 21 starts in every case, on each pool of `pool`
-    recorded segments that share none."""
+    recorded segments; pools share no segment."""
 
     seed: int = Field(ge=0, le=2**31)
     runs: int = Field(ge=1, le=10_000)

@@ -8,10 +8,10 @@ _SHARES = tuple(
 )
 _CLASS = "0 under, 1 good, 2 over"
 
-# parts of the frames that the classifier learns from, watches, is calibrated on and judged on
+# parts of the frames: for training, early stopping, calibration and test of the classifier
 FRAME_PARTS = ("learned", "held_out", "calibration", "judged")
-# what controllers are trained and tuned on, what the default is chosen on, and what is judged once: no
-# segment in two of them
+# parts of the windows: to train and tune controllers, to choose the default, and for one final test; no
+# segment is in two of them
 WINDOW_PARTS = ("learn", "choose", "judge")
 
 CLASSIFIED = Schema(
@@ -96,7 +96,7 @@ AGENT_CURVE = Schema(
 
 
 def _share(name: str, meaning: str) -> tuple[Column, ...]:
-    """A share of runs with its interval and what it rests on: four columns."""
+    """Returns four columns: a share of runs, its interval, and its number of independent runs."""
     return (
         Column(f"{name}_percent", FLOAT, "percent", meaning, 0, 100, nullable=True),
         Column(

@@ -1,9 +1,10 @@
 """Deep Q-learning of setpoints as published (Li and Pattinson 2025, eqs. 10-13, tables 1 and 2): network,
-replay, one phase as one program, and the four phases.
+replay buffer, one training phase as one compiled program, and the four phases.
 
-An `ObservationEncoder` makes the network's input of the paper's 35 numbers. Two heads, one for the flow and
-one for the temperature, each with one maximum and a one-step target of its own; step 100 ends an episode
-without ending the task, so its target still looks ahead."""
+An `ObservationEncoder` turns observations into the network's input, the paper's 35 numbers. The network has
+two heads, one for the flow and one for the temperature; each has its own maximum and its own one-step target.
+An episode ends at step 100, but the task goes on, so the target of that step still looks ahead.
+"""
 
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -45,18 +46,19 @@ from pipeline.setpoint.simulation.simulator import (
 )
 
 ACTIONS = 5  # of each head
-# rows that one product sums: the linear algebra under XLA cuts longer sums by the size of the CPU's first
-# cache (288 numbers in 32 kB)
+# rows in one matrix product: the linear algebra under XLA splits longer sums by the size of the CPU's first
+# cache (288 numbers in 32 kB), so that results would differ between CPUs
 SHORT = 256
 VALIDATION_RUNS = 20  # from each of the 21 starts, to choose a checkpoint by
-RUNS, JUDGED_SEED = 100, 1000  # from each of them, to judge an agent by; and the seed of those runs' chances
-CHECKPOINTS = 16  # of a phase: the network after each of so many equal parts
-TEMPERATURE_SCALE = 30.0  # °C, half the range of the targets: degrees as they come drown the camera's numbers
+RUNS, JUDGED_SEED = 100, 1000  # test runs from each of them; and the seed of their random numbers
+CHECKPOINTS = 16  # equal parts of a phase; the network is kept after each
+TEMPERATURE_SCALE = 30.0  # °C, half the range of the targets: unscaled, they would dominate the camera inputs
 
 
 class QNetwork(eqx.Module):
-    """The paper's network, 47,082 parameters: camera 33 -> 256 and temperatures 2 -> 32,
-    together 288 -> 128 -> 5 + 5, rectified linear. The camera's numbers are a history of classes and (4)."""
+    """The paper's network, 47,082 parameters, rectified linear: camera 33 -> 256 and temperatures 2 -> 32,
+    joined 288 -> 128 -> 5 + 5. The 33 camera inputs are the class history (30) and the class distribution of
+    eq. 4 (3)."""
 
     vision: eqx.nn.Linear
     temperature: eqx.nn.Linear
@@ -71,23 +73,23 @@ class QNetwork(eqx.Module):
         self.heads = eqx.nn.Linear(128, 2 * ACTIONS, key=keys[3])
 
     def __call__(self, state: jax.Array) -> jax.Array:
-        """Q (2, 5) of the flow's and the temperature's actions at a
-        state (history + 5,) of (9), temperatures already scaled."""
-        # both first layers as one product, zeros where one does not see the other's numbers: for a batch that
-        # is dearer in sums and cheaper in moving them
+        """Returns Q (2, 5) of the flow's and the temperature's actions. `state` (history + 5,): eq. 9, with
+        temperatures already scaled."""
+        # both first layers as one product, with zeros between them: for a batch this needs more arithmetic
+        # but less memory traffic
         both = jax.scipy.linalg.block_diag(self.vision.weight, self.temperature.weight)
         hidden = jax.nn.relu(both @ state + jnp.concatenate([self.vision.bias, self.temperature.bias]))
         return self.heads(jax.nn.relu(self.joint(hidden))).reshape(2, ACTIONS)
 
 
 def history_of(network: QNetwork) -> int:
-    """How many former classes it sees."""
+    """Returns the number of former classes that the network takes as input."""
     return network.vision.weight.shape[1] - CLASSES
 
 
 class ObservationEncoder(NamedTuple):
-    """Observations -> the network's input: start() -> memory; encode(parameters, memory, observation) ->
-    (memory, x (d,)). Pure, for one episode."""
+    """Turns observations into the network's input: start() -> memory; encode(parameters, memory, observation)
+    -> (memory, x (d,)). Both are pure functions, for one episode."""
 
     start: Callable[[], Any]
     encode: Callable[[Any, Any, Observation], tuple[Any, jax.Array]]
@@ -95,8 +97,8 @@ class ObservationEncoder(NamedTuple):
 
 @cache
 def paper_encoder(history: int = HISTORY) -> ObservationEncoder:
-    """The state (9): so many former classes, the scaled distribution, and both temperatures as
-    (u - 210) / 30."""
+    """Returns the encoder of the paper's state (9): `history` former classes, the scaled class distribution,
+    and both temperatures as (u - 210) / 30."""
 
     def encode(network, classes, observation):
         state, camera = paper_state(classes, observation), history + CLASSES
@@ -106,10 +108,10 @@ def paper_encoder(history: int = HISTORY) -> ObservationEncoder:
     return ObservationEncoder(Partial(first_history, history), Partial(encode))
 
 
-@cache  # one controller for all networks, so that what was compiled for it is found again
+@cache  # one controller for all networks, so that its compiled program is used again
 def greedy(encoder: ObservationEncoder) -> SetpointController:
-    """The controller that takes the best action of each head; its parameters are the network. The simulator
-    heeds the temperature's every 10th step."""
+    """Returns the controller that takes the best action of each head; its parameters are the network. The
+    simulator applies the temperature's action at every 10th step only."""
     return SetpointController(encoder.start, Partial(_best_action, encoder.encode))
 
 
@@ -123,8 +125,8 @@ def _best_action(encode, network, memory, observation, key):
 
 
 class DqnState(NamedTuple):
-    """Network, its target network (13), and the optimiser's state: all that goes from one phase to the next.
-    The replay buffer does not: its rewards are of the old phase."""
+    """Network, its target network (13), and the optimiser's state: everything that one phase passes to the
+    next. The replay buffer is not passed on, because its rewards belong to the old phase."""
 
     network: eqx.Module
     target_network: eqx.Module
@@ -132,8 +134,8 @@ class DqnState(NamedTuple):
 
 
 class DqnSettings(NamedTuple):
-    """Numbers of table 2 and those it leaves open. Each update comes after one step of `environments`
-    episodes at once. gamma is of both heads, or (2,) of each."""
+    """Settings of table 2, and those that the table leaves open. Each update follows one step of
+    `environments` parallel episodes. `gamma`: discount, one for both heads or (2,) for each."""
 
     gamma: float | jax.Array
     tau: float
@@ -144,11 +146,13 @@ class DqnSettings(NamedTuple):
 
 
 class ReplayRows(NamedTuple):
-    """Transitions: x and what followed (n, d), action and reward of both heads (n, 2), and
-    temperature_action_masked (n,): lambda's clock heeds no temperature action next.
+    """Transitions: `x` and `after` (n, d), the network's input before and after; `action` and `reward` (n, 2)
+    of both heads; `temperature_action_masked` (n,), true if the next temperature action is not applied
+    (lambda's clock).
 
-    Where it is masked, the temperature stands, and the target says so; a maximum there would make waiting
-    free. The replay buffer keeps them as rows of 2 d + 5 numbers: one place to look up each.
+    If it is masked, the temperature's target value is that of "no move"; a maximum there would make waiting
+    free. The replay buffer stores each transition as one row of 2 d + 5 numbers, so that one look-up finds
+    it.
     """
 
     x: jax.Array
@@ -170,8 +174,8 @@ def _unpacked(table: jax.Array) -> ReplayRows:
 
 
 class EnvSpec(NamedTuple):
-    """Where experience comes from: windows, conditions(key) of a new
-    episode, and rewards(state) -> (2,) of both heads."""
+    """The environment: `windows`; `conditions(key)` of a new episode; `rewards(state)` -> (2,), one for each
+    head."""
 
     windows: WindowSource
     conditions: Callable[[jax.Array], EpisodeConditions]
@@ -179,8 +183,8 @@ class EnvSpec(NamedTuple):
 
 
 class DqnProblem(NamedTuple):
-    """What a phase trains on: encoder of the network's input, environment, optimiser,
-    bootstrap(network, target_network, x (d,)) -> values (2,), and the settings."""
+    """What a phase trains on: `encoder` of the network's input; `env`; `optimiser`; `bootstrap(network,
+    target_network, x (d,))` -> values (2,); `settings`."""
 
     encoder: ObservationEncoder
     env: EnvSpec
@@ -190,12 +194,12 @@ class DqnProblem(NamedTuple):
 
 
 def dqn_target(network, target_network, after: jax.Array) -> jax.Array:
-    """max_a Q(s', a; target network) of each head (11)."""
+    """Returns max_a Q(s', a; target network) of each head (2,) (11)."""
     return target_network(after).max(axis=1)
 
 
 def _fresh(problem: DqnProblem, network, keys):
-    """New episodes, one a key: conditions, state, memory and the network's input."""
+    """Starts one episode for each key. Returns conditions, state, memory and the network's input."""
     env, encoder = problem.env, problem.encoder
 
     def one(key):
@@ -207,15 +211,15 @@ def _fresh(problem: DqnProblem, network, keys):
 
 
 def _stepped(problem: DqnProblem, network, episodes, epsilon, u: jax.Array, key):
-    """One step of all episodes under the epsilon-greedy policy, by u (n, 4 + CHANCES) uniform in [0, 1) ->
-    (episodes, their transitions); those that are over start anew, from the key."""
+    """One step of all episodes under the epsilon-greedy policy. `u` (n, 4 + CHANCES): uniform in [0, 1).
+    Returns (episodes, their transitions); finished episodes are restarted from `key`."""
     env = problem.env
     conditions, state, memory, x = episodes
     explores, at_random, befalls = u[:, :2] < epsilon, (ACTIONS * u[:, 2:4]).astype(jnp.int32), u[:, 4:]
     action = jnp.where(explores, at_random, jax.vmap(network)(x).argmax(axis=2))
     action = action.at[:, 1].set(
         jnp.where(state.step % LAMBDA == 0, action[:, 1], STAND)
-    )  # what is not heeded is standing
+    )  # an action that is not applied is recorded as no move
     state, observation = jax.vmap(Partial(stepped, env.windows))(
         conditions, state, Action(action[:, 0], action[:, 1]), befalls
     )
@@ -234,7 +238,7 @@ def _stepped(problem: DqnProblem, network, episodes, epsilon, u: jax.Array, key)
 
 
 def _updated(train_state: DqnState, rows: ReplayRows, problem: DqnProblem) -> DqnState:
-    """One step on (12) for a batch, then (13)."""
+    """Makes one gradient step on the loss (12) for a batch, then updates the target network (13)."""
     network, target_network = train_state.network, train_state.target_network
     gamma, tau = problem.settings.gamma, problem.settings.tau
     ahead = jax.vmap(Partial(problem.bootstrap, network, target_network))(rows.after)
@@ -254,8 +258,8 @@ def _updated(train_state: DqnState, rows: ReplayRows, problem: DqnProblem) -> Dq
 
 
 def _mean_gradient(loss: Callable, network, *batch: jax.Array):
-    """Gradient of the mean of `loss` over the rows of `batch`, as the mean over slices of at most SHORT rows:
-    sums of the same order on every CPU."""
+    """Returns the gradient of the mean of `loss` over the rows of `batch`. It is the mean over slices of at
+    most SHORT rows, so that sums have the same order on every CPU."""
     parts = next(
         n for n in range(1, len(batch[0]) + 1) if len(batch[0]) % n == 0 and len(batch[0]) <= n * SHORT
     )
@@ -264,8 +268,8 @@ def _mean_gradient(loss: Callable, network, *batch: jax.Array):
 
 
 class PhaseResult(NamedTuple):
-    """The train state after a phase, the mean reward of each step (updates,), and the network after each
-    CHECKPOINTS-th of the phase, leaves (CHECKPOINTS, ...)."""
+    """The train state after a phase; the mean reward of each step (updates,); and the networks after each of
+    the CHECKPOINTS equal parts of the phase, with leaves (CHECKPOINTS, ...)."""
 
     train_state: DqnState
     rewards: jax.Array
@@ -281,11 +285,12 @@ def phase(
     longest: int,
     epsilon: tuple[float, float],
 ) -> PhaseResult:
-    """A whole phase as one program; epsilon falls in a line over the first third.
+    """Trains a whole phase as one compiled program. Epsilon falls linearly over the first third of the
+    updates.
 
-    A step of all episodes, one batch from an empty replay buffer, one update, `updates` times. Episodes start
-    at different steps, so that they do not end together. Phases with the same `longest`, the updates of the
-    longest of them, are one program compiled once.
+    Starts with an empty replay buffer, then `updates` times: one step of all episodes, one batch, one update.
+    Episodes start at different steps, so that they do not end together. `longest`: the updates of the longest
+    phase; phases with the same `longest` share one program, compiled once.
     """
     train_state, rewards, checkpoints = _phase(
         train_state, key, problem, jnp.asarray(updates), jnp.asarray(epsilon), longest=longest
@@ -300,8 +305,8 @@ def _phase(train_state: DqnState, key, problem: DqnProblem, updates, epsilon, *,
     n, capacity = settings.environments, settings.capacity
     conditions, state, memory, x = _fresh(problem, train_state.network, jax.random.split(k_start, n))
     state = state._replace(step=LAMBDA * jax.random.randint(k_clock, (n,), 0, settings.episode // LAMBDA))
-    # a step draws some thousand numbers: by XLA's own generator
-    # (Philox), which costs a tenth of jax's default there
+    # a step draws some thousand random numbers, so XLA's own generator
+    # (Philox) is used, which costs a tenth of jax's default here
     fast = jax.random.wrap_key_data(jnp.tile(jax.random.key_data(key), 2), impl="rbg")
 
     def one(i, carry):
@@ -333,7 +338,7 @@ def _phase(train_state: DqnState, key, problem: DqnProblem, updates, epsilon, *,
 
 
 class PublishedAgent(NamedTuple):
-    """Networks after phases 1 to 4, of the fourth the best checkpoint, and the mean reward of each step of
+    """The networks after phases 1 to 4 (for phase 4 the best checkpoint), and the mean reward of each step of
     each phase."""
 
     networks: tuple[QNetwork, ...]
@@ -341,12 +346,13 @@ class PublishedAgent(NamedTuple):
 
 
 def ellipse(a, b, state: MachineState) -> jax.Array:
-    """(2,): the reward (14) of the state, the same for both heads."""
+    """Returns the reward (14) of the state, repeated for both heads (2,)."""
     return jnp.tile(reward(state.flow, state.temperature, a=a, b=b), 2)
 
 
 def anywhere(accuracy, key: jax.Array) -> EpisodeConditions:
-    """A machine that does as it is told, from a flow and temperature uniform within the limits."""
+    """Returns the conditions of an undisturbed machine that starts at a flow and temperature uniform within
+    the limits."""
     u = jax.random.uniform(key, (2,))
     low, high = jnp.array([FLOW_LIMITS, TEMPERATURE_LIMITS]).T
     flow, temperature = low + (high - low) * u
@@ -354,10 +360,10 @@ def anywhere(accuracy, key: jax.Array) -> EpisodeConditions:
 
 
 class PublishedTraining(NamedTuple):
-    """`updates` of each phase, as many phases as there are numbers; accuracy of the windows in the last one.
+    """`updates`: of each phase, one number for each phase; `accuracy`: of the windows in the last phase.
 
-    Epsilon falls from `explore` of each phase to `least`. history is eta of (8). The learning rate of phase 4
-    falls in a line to the share `rate_at_end`, 1 if it does not fall.
+    In each phase epsilon falls from its `explore` to `least`. `history`: eta of (8). The learning rate of
+    phase 4 falls linearly to the fraction `rate_at_end` (1: it does not fall).
     """
 
     dqn: DqnSettings
@@ -371,8 +377,9 @@ class PublishedTraining(NamedTuple):
 
 
 def train_published(key: jax.Array, settings: PublishedTraining) -> PublishedAgent:
-    """The four phases: reward shapes (40, 20), (40, 10), (20, 10) on windows that are always right, then the
-    last shape with `accuracy`; Adam. Of the fourth phase the best checkpoint is kept."""
+    """Trains the four phases with Adam. Reward shapes are (40, 20), (40, 10) and (20, 10) with windows that
+    are always right; phase 4 keeps the last shape, with windows of the given `accuracy`, and keeps its best
+    checkpoint."""
     train_state, key = begin_published(key, settings)
     networks, all_rewards = [], []
     for i in range(len(settings.updates)):
@@ -385,25 +392,26 @@ def train_published(key: jax.Array, settings: PublishedTraining) -> PublishedAge
 
 
 def begin_published(key: jax.Array, settings: PublishedTraining) -> tuple[DqnState, jax.Array]:
-    """The train state before phase 1, and the key of all phases."""
+    """Returns the train state before phase 1, and the key of all phases."""
     k_network, key = jax.random.split(key)
     network = QNetwork(k_network, settings.history)
     moments = _adam(settings.learning_rate).init(eqx.filter(network, eqx.is_array))
     return DqnState(network, network, moments), key
 
 
-@cache  # one for phases alike, so that what was compiled for them is found again
+@cache  # one for equal phases, so that their compiled program is used again
 def _adam(
     rate: float, at_end: float = 1.0, updates: int = 1, before: int = 0
 ) -> optax.GradientTransformation:
-    """Adam at a rate that falls in a line to the share at_end within so many updates after those before."""
+    """Returns Adam with a learning rate that falls linearly to the fraction `at_end` within `updates`
+    updates, after the `before` updates of earlier phases."""
     return optax.adam(optax.linear_schedule(rate, rate * at_end, updates, before))
 
 
 def published_phase(
     train_state: DqnState, key: jax.Array, settings: PublishedTraining, i: int
 ) -> PhaseResult:
-    """Phase i + 1 from what the one before left."""
+    """Trains phase i + 1, starting from the train state of the phase before."""
     a, b = PHASES[min(i, len(PHASES) - 1)]
     last = i == len(PHASES)
     right, before = settings.accuracy if last else 1.0, sum(settings.updates[:i])
@@ -427,8 +435,9 @@ def published_phase(
 
 
 class Checkpoint(NamedTuple):
-    """A network in the middle of a phase, after so many of its CHECKPOINTS, and the shares in percent of
-    validation runs from the 21 starts that settle, and that settle and stay."""
+    """A network in the middle of a phase; `after`, how many of the CHECKPOINTS parts are done; and the
+    percentages of validation runs from the 21 starts that reach the target (`settled`), and that reach and
+    keep it (`stay`)."""
 
     network: QNetwork
     after: int
@@ -437,7 +446,8 @@ class Checkpoint(NamedTuple):
 
 
 def best_checkpoint(result: PhaseResult, key: jax.Array, settings: PublishedTraining) -> Checkpoint:
-    """Of a phase's checkpoints the one of which most validation runs stay; of equal ones the last."""
+    """Returns the checkpoint of a phase with most validation runs that keep the target. A tie goes to the
+    most runs that reach it, then to the last checkpoint."""
     conditions = trials.starts(VALIDATION_RUNS, accuracy=settings.accuracy)
     key, found = jax.random.fold_in(key, 100), []
     for k in range(CHECKPOINTS):
@@ -448,8 +458,8 @@ def best_checkpoint(result: PhaseResult, key: jax.Array, settings: PublishedTrai
 
 
 def run_starts(network: QNetwork, *, accuracy: float) -> Trajectory:
-    """RUNS from each of the 21 starts, on draws that neither training nor validation saw: what every page
-    tells of an agent on the paper's simulator is told of these."""
+    """Simulates RUNS episodes from each of the 21 starts, with random numbers used neither in training nor in
+    validation. Every page's figures for an agent on the paper's simulator come from these runs."""
     key, conditions = jax.random.key(JUDGED_SEED), trials.starts(RUNS, accuracy=accuracy)
     return rollout(published(network), network, paper_windows(), conditions, key, steps=STEPS)
 
@@ -458,7 +468,7 @@ def run_starts(network: QNetwork, *, accuracy: float) -> Trajectory:
 
 
 def weights(network: eqx.Module) -> dict[str, np.ndarray]:
-    """The network's arrays by their place in it, for the edge to write."""
+    """Returns the network's arrays, named by their place in it, to be written to a file."""
     return {_place(path): np.asarray(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(network)}
 
 
@@ -467,15 +477,15 @@ def _place(path) -> str:
 
 
 def untrained(make: Callable[..., eqx.Module], *sizes: int) -> eqx.Module:
-    """make(key, *sizes) with the shapes of its arrays only, for `with_weights`: what draws weights takes long
-    to compile, and these would be thrown away."""
+    """Returns make(key, *sizes) with the shapes of its arrays only, for `with_weights`. Drawing random
+    weights takes long to compile, and they would be thrown away."""
     return eqx.filter_eval_shape(lambda key: make(key, *sizes), jax.random.key(0))
 
 
 def with_weights(network: eqx.Module, arrays: dict[str, np.ndarray]) -> eqx.Module:
-    """The network with these arrays in the places of its own, of which the shapes suffice (`untrained`).
+    """Returns the network with these arrays in place of its own; shapes suffice for its own (`untrained`).
 
-    Raises ValueError where names or shapes are those of another architecture.
+    Raises ValueError if names or shapes belong to another architecture.
     """
     own = {_place(path): np.shape(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(network)}
     wrong = sorted(own.keys() ^ arrays.keys()) or [
@@ -496,13 +506,13 @@ def with_weights(network: eqx.Module, arrays: dict[str, np.ndarray]) -> eqx.Modu
 
 
 def published(network: QNetwork) -> SetpointController:
-    """The controller of the paper's agent, whose parameters are this network."""
+    """Returns the controller of the paper's agent; its parameters are this network."""
     return greedy(paper_encoder(history_of(network)))
 
 
 def build(
     settings: Mapping[str, Any], agents: PublishedAgent, windows: Any
 ) -> tuple[SetpointController, QNetwork]:
-    """The agent of Li and Pattinson (2025) after the last of its phases that was trained."""
+    """Returns the agent of Li and Pattinson (2025) after its last trained phase."""
     network = agents.networks[-1]
     return published(network), network

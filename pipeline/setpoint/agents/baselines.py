@@ -1,9 +1,9 @@
-"""Controllers without learning, behind the interface of the agent: nothing, and a sequential test (CUSUM) of
-the window's class.
+"""Controllers without learning, with the same interface as the agent: no control, and a sequential test
+(CUSUM) of the window's class.
 
-The class depends on the flow alone, so nothing that the camera sees bears on the temperature: every
-controller here moves the target to 210 °C in the largest steps that lambda's clock allows, which the lag (6)
-then follows. The Bayes filter is in flow_filter.py.
+The class depends on the flow alone, so the camera gives no information on the temperature. Every controller
+here moves the target to 210 °C in the largest steps that lambda's clock allows; the temperature follows with
+the lag (6). The Bayes filter is in flow_filter.py.
 """
 
 from collections.abc import Mapping
@@ -27,20 +27,21 @@ from pipeline.setpoint.simulation.simulator import (
 
 
 def nearest(moves: tuple[float, ...], wanted: jax.Array) -> jax.Array:
-    """The index of the move nearest to the wanted one; of two as near, the smaller."""
+    """Returns the index of the move nearest to the wanted one. If two are equally near, takes the smaller
+    move."""
     distance = jnp.abs(jnp.asarray(moves) - wanted) + 1e-4 * jnp.abs(jnp.asarray(moves))
     return jnp.argmin(distance).astype(jnp.int32)
 
 
 def temperature_move(observation: Observation) -> jax.Array:
-    """Straight to 210 °C: the move nearest to u* - u_bar. It says so
-    at every step; lambda's clock takes every tenth."""
+    """Returns the move that takes the target straight to 210 °C: the one nearest to u* - u_bar. It is given
+    at every step, and lambda's clock applies every tenth."""
     return nearest(TEMPERATURE_MOVES, BEST_TEMPERATURE - observation.target)
 
 
 @cache
 def nothing() -> SetpointController:
-    """Never moves the flow, whatever it sees: what any other controller must be better than. Its parameters
+    """Returns the controller that never moves the flow; every other controller must be better. Its parameters
     are ()."""
 
     def act(parameters, memory: tuple, observation: Observation, key: jax.Array) -> tuple[tuple, Action]:
@@ -50,8 +51,8 @@ def nothing() -> SetpointController:
 
 
 class SequentialTest(NamedTuple):
-    """accuracy: of the class, as the test assumes it; threshold and cap in units of log likelihood ratio, the
-    cap the most that a class may fall behind."""
+    """`accuracy`: of the class, as the test assumes it. `threshold` and `cap` are in units of log likelihood
+    ratio; the cap is the most by which a class may fall behind."""
 
     accuracy: float
     threshold: float
@@ -60,12 +61,12 @@ class SequentialTest(NamedTuple):
 
 @cache
 def sequential_test() -> SetpointController:
-    """A running test of the three classes, 10 % against under or over where it leads good by the threshold
-    (Wald 1945; capped as in Page's CUSUM, 1954).
+    """Returns a sequential test of the three classes. It moves the flow by 10 % against under or over if that
+    class leads good by the threshold (Wald 1945; capped as in Page's CUSUM, 1954).
 
         S_i <- max(S_i + log P(x | i) - max_j (S_j + log P(x | j)), -cap)
 
-    The cap lets a class come back, once a move or a clog has made it true.
+    The cap lets a class recover quickly once a move or a clog has made it true.
     """
 
     def act(

@@ -1,4 +1,5 @@
-"""What Li and Pattinson (2025) claim of their agent on their simulator, beside what trained ones come to."""
+"""Published figures of the agent of Li and Pattinson (2025) on their simulator, compared with agents trained
+here."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,13 +12,13 @@ from pipeline.setpoint.agents.agent import JUDGED_SEED, RUNS, run_starts
 from pipeline.setpoint.agents.score import judge
 from pipeline.setpoint.simulation.simulator import Trajectory, nominal, paper_windows, rollout
 
-# decisions of a run from a single start, and those at its end over which it has come to rest
+# decisions of a run from a single start, and the last ones, over which the resting flow is averaged
 SHOWN, RESTING = 100, 20
 
 
 def simulated_figures(networks: Sequence[agent.QNetwork]) -> dict[str, dict[str, Any]]:
-    """Figures of the networks after three phases and after the last, from the 21 starts, with the class
-    always right and right with probability 0.7."""
+    """Returns figures of the networks after three phases and after the last, from the 21 starts, with the
+    class always right and right with probability 0.7."""
     cases = {"phase3": (2, 1.0), "phase4": (3, 0.7), "phase4_at_1": (3, 1.0), "phase3_at_0.7": (2, 0.7)}
     return {
         name: _figures(run_starts(networks[i], accuracy=accuracy))
@@ -27,7 +28,8 @@ def simulated_figures(networks: Sequence[agent.QNetwork]) -> dict[str, dict[str,
 
 
 def run_start(network: agent.QNetwork, flow: float, temperature: float, *, accuracy: float) -> Trajectory:
-    """RUNS of SHOWN decisions from one start in percent and °C, on the draws of `run_starts`' seed."""
+    """Simulates RUNS runs of SHOWN decisions from one start in percent and °C, with the random seed of
+    `run_starts`."""
     key, conditions = (
         jax.random.key(JUDGED_SEED),
         nominal(np.full(RUNS, flow), temperature, accuracy=accuracy),
@@ -36,11 +38,11 @@ def run_start(network: agent.QNetwork, flow: float, temperature: float, *, accur
 
 
 def compare_starts(networks: Sequence[agent.QNetwork], *, accuracy: float) -> dict[str, dict[str, Any]]:
-    """What Li and Pattinson (2025) print of single starts (sections 3.3 and 3.4, figures 7 and 8), beside
-    what RUNS runs of ours come to: medians, in percent of flow and °C. `accuracy` is the last phase's.
+    """Returns what Li and Pattinson (2025) publish for single starts (sections 3.3 and 3.4, figures 7 and 8),
+    and the medians of RUNS runs of ours, in percent of flow and °C. `accuracy`: of the last phase.
 
-    rests_at: mean flow of the last decisions; least and most: of the flow after it first came within 10 % of
-    100 %; flow_range and temperature_range: from least to most over the second half of the run.
+    `rests_at`: mean flow of the last decisions; `least` and `most`: of the flow after it first came within 10
+    % of 100 %; `flow_range` and `temperature_range`: largest minus smallest over the second half of the run.
     """
     last = networks[-1]
     printed = {
@@ -65,7 +67,7 @@ def compare_starts(networks: Sequence[agent.QNetwork], *, accuracy: float) -> di
 
 
 def measure_runs(flow: np.ndarray, temperature: np.ndarray) -> dict[str, float | None]:
-    """The medians of `compare_starts` of runs (n, steps + 1)."""
+    """Returns the medians of `compare_starts` for runs (n, steps + 1)."""
     q, u = flow, temperature
     since = np.maximum.accumulate(np.abs(q - 100.0) <= 10.0 + 1e-3, axis=1)
     came, half = since.any(axis=1), (q.shape[1] - 1) // 2
@@ -83,7 +85,7 @@ def measure_runs(flow: np.ndarray, temperature: np.ndarray) -> dict[str, float |
 
 
 def parameters(network: Any) -> int:
-    """How many numbers a network has."""
+    """Returns the number of parameters of a network."""
     return sum(np.size(leaf) for leaf in jax.tree.leaves(network))
 
 

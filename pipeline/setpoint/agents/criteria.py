@@ -1,19 +1,19 @@
-"""By what a run of a controller of setpoints is judged: plain numbers, so that a page can name them without a
-simulator."""
+"""Criteria by which a run of a setpoint controller is scored: plain numbers, so that a page can use them
+without a simulator."""
 
 FLOW_BAND, TEMPERATURE_BAND = 10.0, 5.0  # about 100 % and 210 °C
 SETTLED_BY, DWELL_UNTIL, STEPS = (
     90,
     100,
     200,
-)  # inside from some step <= 90 until 100; never out from 100 to 200 is staying
+)  # settled: inside from some step <= 90 until 100; stay: never outside from 100 to 200
 CLOG_STEP, RECOVERED_UNTIL = 60, 120
 BEYOND = (10, 15, 25)  # points of flow past which a run from a good start counts as harmed
 NO_CONTROL = "do nothing"  # the controller that leaves every print alone
-BACK_BAND = 15.0  # within which a half clogged nozzle shall be brought back
+BACK_BAND = 15.0  # percent: to which the flow of a half clogged nozzle must return
 
 
 def harm_bar(case: str, *, perfect: float, in_band: float) -> float | None:
-    """Percent of runs from good starts that may leave +-25 % in this case; None if nobody is barred: of a
-    camera of another scale no rule can know better, and harm is only told."""
+    """Returns the percentage of runs from good starts that may leave +-25 % in this case. None means no
+    limit: no controller can detect a camera of another scale, so harm is only reported."""
     return {"perfect": perfect, "in band": in_band}.get(case)

@@ -1,5 +1,5 @@
-"""What train_agent of the second pipeline leaves: the networks of Li and Pattinson (2025) after each phase,
-to one file and back."""
+"""Stores the networks of Li and Pattinson (2025) after each phase, which train_agent of the second pipeline
+trains, in one file, and restores them."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ PUBLISHED_SCHEMA = "published agent 1"
 
 
 def store_published(path: Path, networks: Sequence[QNetwork]) -> None:
-    """The networks of Li and Pattinson (2025) after each phase."""
+    """Writes the networks of Li and Pattinson (2025) after each phase."""
     arrays = {
         f"phase{i + 1}.{name}": a for i, n in enumerate(networks) for name, a in agent.weights(n).items()
     }
@@ -25,7 +25,8 @@ def store_published(path: Path, networks: Sequence[QNetwork]) -> None:
 
 
 def restore_published(path: Path | str) -> agent.PublishedAgent:
-    """What `store_published` wrote, without rewards. Raises ValueError if the file is none."""
+    """Returns the agent that `store_published` wrote, without rewards. Raises ValueError if the file holds
+    none."""
     arrays, about = read_weights(path, PUBLISHED_SCHEMA)
     with artifacts.about(path):
         parts = [_part(arrays, f"phase{i + 1}") for i in range(int(about["phases"]))]
@@ -33,7 +34,7 @@ def restore_published(path: Path | str) -> agent.PublishedAgent:
 
 
 def _network(part: dict[str, np.ndarray]) -> QNetwork:
-    """The network of these arrays, whose history is as long as they say."""
+    """Returns the network with these arrays; the length of its history follows from their shapes."""
     numbers = np.shape(part.get("vision.weight", np.zeros((256, HISTORY + CLASSES))))
     shapes = agent.untrained(QNetwork, max(numbers[-1] - CLASSES, 1))
     return cast(QNetwork, agent.with_weights(shapes, part))

@@ -1,5 +1,5 @@
-"""What a run of a controller of setpoints is worth, by its true flow and temperature: settled, staying,
-recovered, harmed; and how sure a share of runs is."""
+"""Scores a run of a setpoint controller by its true flow and temperature: whether it reaches and keeps the
+target, recovers, or disturbs a good print; and how certain a share of runs is."""
 
 from typing import NamedTuple
 
@@ -19,19 +19,22 @@ from pipeline.setpoint.agents.criteria import (
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
 from pipeline.statistics import PooledShare, pooled_share, wilson
 
-# float32 sums of moves end a hair outside a border that they are on
+# tolerance: float32 sums of moves may end slightly outside a border that they should lie on
 ROUNDING = 1e-3
 
 
 class Outcomes(NamedTuple):
-    """n runs, each (n,) unless said. flow and temperature at the start; entered: the step from which the run
-    is inside 90-110 % and 210 +- 5 °C until 100, 101 where it is outside then.
+    """Outcomes of n runs, (n,) unless stated. "Inside" means 90-110 % flow and 210 +- 5 °C. `flow` and
+    `temperature`: at the start; `entered`: step from which the run is inside until step 100, 101 if it is
+    outside then.
 
-    settled: entered by 90; stay: settled, and never out from 100 to 200; recovered: inside from some step <=
-    90 until 120; recovery: decisions from CLOG_STEP until inside for good until 200, infinite if never; back:
-    within +-15 % likewise; beyond (n, 3): farther than BEYOND from 100 % at some step; overshoot: points of
-    flow past 100 % on the far side of the start, before step 60; flow_error: mean |q - 100 %| over steps 100
-    to 200."""
+    `settled`: entered by step 90; `stay`: settled, and never outside from 100 to 200; `recovered`: inside
+    from some step <= 90 until 120; `recovery`: decisions from CLOG_STEP until inside for good until 200,
+    infinite if never; `back`: as recovered, but within +-15 %; `beyond` (n, 3): further than BEYOND from 100
+    % at some step; `overshoot`: points of flow past 100 % on the far side of the start, before step 60;
+    `flow_error`: mean
+    q - 100 %| over steps 100 to 200.
+    """
 
     flow: np.ndarray
     temperature: np.ndarray
@@ -47,11 +50,12 @@ class Outcomes(NamedTuple):
 
 
 class RunScore(NamedTuple):
-    """n runs. Shares of all runs as `Outcomes` says, `beyond` one for each of BEYOND.
+    """Score of n runs. Shares are of all runs, as in `Outcomes`; `beyond` has one for each of BEYOND.
 
-    median_steps and p90_steps of the settled runs until they are inside for good (NaN where none settled);
-    overshoot_p95, the 95th percentile; flow_error, the mean; worst_start names the start with the fewest
-    settled, with its percent; recovery_p95, the 95th percentile of all runs (NaN if fewer are ever back).
+    `median_steps` and `p90_steps`: decisions of the settled runs until inside for good (NaN if none settled);
+    `overshoot_p95`: 95th percentile; `flow_error`: mean; `worst_start`: flow, temperature and percentage
+    settled of the start with the fewest settled runs; `recovery_p95`: 95th percentile of all runs (NaN if
+    fewer ever recover).
     """
 
     runs: int
@@ -69,16 +73,16 @@ class RunScore(NamedTuple):
 
 
 def judge(flow: np.ndarray, temperature: np.ndarray) -> RunScore:
-    """The score of n trajectories of at least 200 decisions that share nothing, by their true flow (percent)
-    and temperature (°C), each (n, 201 or more).
+    """Returns the score of n independent trajectories, from their true flow (percent) and temperature (°C),
+    each (n, 201 or more).
 
-    Raises ValueError for shorter ones.
+    Raises ValueError for fewer than 200 decisions.
     """
     return summary(outcomes(flow, temperature))
 
 
 def outcomes(flow: np.ndarray, temperature: np.ndarray) -> Outcomes:
-    """What became of each of n trajectories (n, 201 or more). Raises ValueError for shorter ones."""
+    """Returns the outcomes of n trajectories (n, 201 or more). Raises ValueError for shorter ones."""
     flow, temperature = np.asarray(flow, float), np.asarray(temperature, float)
     if flow.shape[1] <= STEPS:
         raise ValueError(
@@ -108,9 +112,9 @@ def outcomes(flow: np.ndarray, temperature: np.ndarray) -> Outcomes:
 
 
 def summary(of: Outcomes, *, pools: int | None = None) -> RunScore:
-    """The score of runs on so many pools of segments, pool by pool as many: intervals and what they are worth
-    by how the pools differ (`statistics.effective`). Without pools the runs share nothing, and the intervals
-    are Wilson's."""
+    """Returns the score of runs on `pools` pools of segments, ordered by pool, equally many on each.
+    Intervals and effective numbers of runs follow from the differences between pools
+    (`statistics.effective`). Without pools the runs are independent, and the intervals are Wilson's."""
 
     def share(happened: np.ndarray) -> PooledShare:
         if pools is None:
@@ -136,8 +140,8 @@ def summary(of: Outcomes, *, pools: int | None = None) -> RunScore:
 
 
 def _inside_since(inside: np.ndarray, until: int) -> np.ndarray:
-    """The first step (n,) from which each run is inside through step
-    `until`; until + 1 where it is outside then."""
+    """Returns the first step (n,) from which each run is inside through step `until`; until + 1 if it is
+    outside then."""
     out = ~inside[:, until::-1]
     return np.where(out.any(axis=1), until + 1 - out.argmax(axis=1), 0)
 

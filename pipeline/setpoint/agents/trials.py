@@ -1,4 +1,4 @@
-"""The starts of Li and Pattinson (2025) from which controllers run, and what runs from them are worth."""
+"""The starts of Li and Pattinson (2025) from which controllers run, and the score of runs from them."""
 
 from collections.abc import Sequence
 
@@ -24,7 +24,7 @@ STARTS = len(START_FLOWS) * len(START_TEMPERATURES)
 
 
 def starts(runs: int, *, accuracy: float) -> EpisodeConditions:
-    """The 21 starts of the paper, `runs` times each (21 runs,), on a machine that does as it is told."""
+    """Returns the 21 starts of the paper, `runs` times each (21 runs,), on a machine without disturbances."""
     flow, temperature = (
         a.ravel() for a in np.meshgrid(np.repeat(START_FLOWS, runs), START_TEMPERATURES, indexing="ij")
     )
@@ -32,7 +32,7 @@ def starts(runs: int, *, accuracy: float) -> EpisodeConditions:
 
 
 def good_starts(flows: Sequence[float] | np.ndarray, runs: int) -> EpisodeConditions:
-    """From each of the flows (percent) at 210 °C, `runs` times."""
+    """Returns starts at each of the flows (percent) and 210 °C, `runs` times each."""
     return nominal(np.repeat(flows, runs), BEST_TEMPERATURE, accuracy=1.0)
 
 
@@ -43,6 +43,6 @@ def evaluate(
     conditions: EpisodeConditions,
     key: jax.Array,
 ) -> RunScore:
-    """Roll out and judge runs that share nothing."""
+    """Simulates independent runs and returns their score."""
     trajectory = rollout(controller, parameters, windows, conditions, key, steps=STEPS)
     return judge(np.asarray(trajectory.flow), np.asarray(trajectory.temperature))

@@ -1,5 +1,5 @@
-"""From the frames of a window to a setpoint that may be sent: what the frames say together, and why it acted.
-When to hold, limits and waits are `actuation`'s."""
+"""From the frames of a window to a setpoint that may be sent: combines the frames, and gives the reason for
+each decision. `actuation` decides when nothing may be sent, and sets limits and waits."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -27,12 +27,13 @@ CLASSES = ("under", "good", "over")
 
 
 class JudgedWindow(NamedTuple):
-    """What E windows of frames say. `reason` indexes REASONS: 0 acts, all else holds.
+    """Combined results of E windows of frames. `reason` (E,) indexes REASONS: with 0 the loop acts, otherwise
+    it sends nothing.
 
-    p (E, 3) shares of the classes, label (E,) the class of p, score (E,) the median out-of-distribution
-    score, valid (E,) and used (E,) the frames that were valid and the frames that count, reason (E,),
-    flow_seen (E,) in percent of nominal and spread (E,), the deviation of its logarithm. Where no frame
-    counts, p is 1/3 each and score, flow and spread NaN.
+    `p` (E, 3): shares of the classes; `label` (E,): the most probable class; `score` (E,): median
+    out-of-distribution score; `valid` (E,): number of valid frames; `used` (E,): number of frames that count;
+    `flow_seen` (E,): in percent of nominal; `spread` (E,): standard deviation of its logarithm. If no frame
+    counts, p is 1/3 each and flow and spread are NaN; without a sound frame the score is NaN, too.
     """
 
     p: np.ndarray
@@ -46,8 +47,8 @@ class JudgedWindow(NamedTuple):
 
 
 def deployed_limits(per_action: Sequence[float], per_minute: Sequence[float]) -> SetpointLimits:
-    """The published limits of setpoints, and what one action and one minute may change, (2,) each: flow in
-    percent and target in °C."""
+    """Returns the published range of setpoints with the largest change of one action and of one minute, (2,)
+    each: flow in percent and target in °C."""
     ends = (np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True))
     return SetpointLimits(*ends, np.array(per_action), np.array(per_minute))
 
@@ -62,16 +63,17 @@ def judge_window(
     least_frames: int,
     foreign_above: float,
 ) -> JudgedWindow:
-    """E windows of W frames each: class probabilities (E, W, 3), valid (E, W), out-of-distribution scores (E,
-    W), tip moved (E,) -> what they say together.
+    """Combines the frames of E windows of W frames each. `probabilities` (E, W, 3) of the classes; `valid`
+    (E, W); `scores` (E, W), out-of-distribution; `tip_moved` (E,).
 
-    A frame counts when its key area is valid, its probabilities are a distribution and its score is at most
-    `foreign_above`. Of the m that count
+    A frame counts if its key area is valid, its probabilities are a distribution and its score is at most
+    `foreign_above`. From the frames that count follows
 
         flow_seen, spread, p = flows(frames that count (E, W))      window_flow.window_flow
 
-    Held: fewer than `least_frames` count (by what cost the most of them), or the tip has moved. How sure the
-    flow is, is for the controller to weigh.
+    The loop must not act if fewer than `least_frames` count (the reason is the commoner cause), or if the tip
+    has moved. The controller weighs how certain the flow is. Raises ValueError for other shapes, or if
+    `least_frames` is below 1.
     """
     P, valid, scores = np.asarray(probabilities, float), np.asarray(valid, bool), np.asarray(scores, float)
     if (
@@ -103,8 +105,8 @@ def judge_window(
 
 
 def _median(scores: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """The median (the upper one of two) of each row over what was seen, NaN where nothing was. A missing
-    score is infinite: nothing vouches for that frame."""
+    """Returns the median (the upper of two) of each row over the frames in `mask`; NaN if there is none. A
+    missing score counts as infinite, because nothing shows that the frame is familiar."""
     ordered = np.sort(np.where(mask & ~np.isnan(scores), scores, np.inf), axis=1)
     n = mask.sum(axis=1)
     ordered = np.concatenate([ordered, np.full((len(n), 1), np.nan)], axis=1)
@@ -112,7 +114,8 @@ def _median(scores: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def camera_guard(camera: KnownCamera | None, proof: CameraProof) -> Callable[[np.ndarray], np.ndarray] | None:
-    """foreign(looks) for `camera_seen`; None where the camera cannot be judged: everything is held."""
+    """Returns foreign(looks) for `camera_seen`; None if the camera cannot be judged, and then nothing is
+    sent."""
     if camera is None or not may_judge(proof):
         return None
     return partial(familiar.foreign, camera, false_alarms=FALSE_ALARMS)
@@ -124,11 +127,12 @@ def camera_seen(
     looks: np.ndarray,
     foreign: Callable[[np.ndarray], np.ndarray] | None,
 ) -> JudgedWindow:
-    """E windows, held too where the picture stands still or is of no camera that is known.
+    """Returns the windows, with a reason not to act also if the picture stands still or the camera is
+    unknown.
 
-    last_seen (E,) is the flow that the window before showed, NaN where there was none; looks (E, measures)
-    how the windows look (`familiar`), NaN where no frame was measured; foreign(looks) -> (E,) bool, None
-    where the camera cannot be judged (`proof`): all windows are held.
+    `last_seen` (E,): flow of the window before, NaN if there was none; `looks` (E, measures): how the windows
+    look (`familiar`), NaN if no frame was measured; `foreign(looks)`: (E,) bool, None if the camera cannot be
+    judged (`proof`), and then no window is acted on.
     """
     reason = np.where(window.reason == ACTS, still(window.flow_seen, last_seen), window.reason)
     if foreign is None:
@@ -139,8 +143,8 @@ def camera_seen(
 
 
 def why(time_s: float, window: JudgedWindow, i: int, change: np.ndarray) -> str:
-    """One line of the strip "why it acted" for window i: time, what
-    was seen, what was sent or why it was held."""
+    """Returns the line of the "why it acted" log for window i: time, what was seen, and what was sent or why
+    nothing was sent."""
     frames = f"{time_s:6.1f} s: {window.valid[i]} frames valid, {window.used[i]} count"
     if window.reason[i] == ACTS:
         moves = (

@@ -1,5 +1,5 @@
 """The closed loop through pixels: setpoints -> heater and melt -> rendered frames -> key areas -> classifier
--> window -> hold or controller -> setpoints."""
+-> window -> controller, or no action -> setpoints."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -18,16 +18,16 @@ from pipeline.setpoint.simulation import actuation
 from pipeline.setpoint.simulation.actuation import ACTS, SetpointLimits, Waits
 from pipeline.setpoint.simulation.simulator import Observation, SetpointController
 
-# of the nozzle, for the alarm that the camera moved: at least LOOKS frames of a window are looked at; what is
-# less alike, or hardly more than at home, is not the nozzle elsewhere
+# for the alarm that the camera moved: at least LOOKS frames of a window are searched for the nozzle; a place
+# with less than LIKENESS, or hardly more than at home (ADVANTAGE), does not count as the nozzle
 TEMPLATE_PX, REACH_PX, LOOKS, LIKENESS, ADVANTAGE = 80, 30, 5, 0.4, 0.12
 
 # ---- the machine
 
 
 class MachineDynamics(NamedTuple):
-    """Heater: first order, heater_s, after heater_delay_s. Melt: melt_s at 210 °C is how long it empties,
-    longer by `softening` per °C below."""
+    """Heater: first order with time constant `heater_s`, after the delay `heater_delay_s`. Melt: it empties
+    with time constant `melt_s` at 210 °C, longer by the factor exp(softening_per_degC) per °C below."""
 
     heater_s: float
     heater_delay_s: float
@@ -36,8 +36,8 @@ class MachineDynamics(NamedTuple):
 
 
 class Running(NamedTuple):
-    """State of E machines: temperature (E,) °C, stored (E,) the volume already in the melt, in percent of
-    nominal flow times s, and the targets on their way to the heater, oldest first (E, delay)."""
+    """State of E machines: `temperature` (E,) °C; `stored` (E,), volume already in the melt, in percent of
+    nominal flow times s; `coming` (E, delay + 1), targets on their way to the heater, oldest first."""
 
     temperature: np.ndarray
     stored: np.ndarray
@@ -45,7 +45,7 @@ class Running(NamedTuple):
 
 
 def at_rest(machine: MachineDynamics, flow: np.ndarray, temperature: np.ndarray, *, tick_s: float) -> Running:
-    """Machines that have long been fed flow (E,) in percent at temperature (E,) in °C."""
+    """Returns machines in steady state at flow (E,) in percent and temperature (E,) in °C."""
     temperature = np.asarray(temperature, float)
     delay = round(machine.heater_delay_s / tick_s)
     return Running(
@@ -62,14 +62,14 @@ def tick(
     *,
     tick_s: float,
 ) -> tuple[Running, np.ndarray]:
-    """The next state and the mean flow (E,) out of the nozzle over a tick,
-    for those that run (E,) bool; the others stand still.
+    """Returns the next state, and the mean flow (E,) out of the nozzle over a tick. Machines with `running`
+    (E,) false keep their state.
 
         T' = (target(t - delay) - T) / heater_s
         V' = feed - V / tau(T)    flow = V / tau    tau = melt_s exp(-softening (T - 210))
 
-    What is fed leaves, later, and a melt that heats up lets go of what it holds. Both are exact for inputs
-    that are constant over the tick.
+    All that is fed leaves, but later; a melt that heats up releases part of its content. Both solutions are
+    exact if the inputs are constant over the tick.
     """
     tau = _melt_s(machine, state.temperature)
     stored = feed * tau + (state.stored - feed * tau) * np.exp(-tick_s / tau)
@@ -90,9 +90,9 @@ def _melt_s(machine: MachineDynamics, temperature: np.ndarray) -> np.ndarray:
 
 
 class PixelDisturbances(NamedTuple):
-    """Of E episodes, counted in decisions: the feed is multiplied by clog (E,) from clog_at (E,) on; the
-    camera moves by shift_px (E, 2) at shift_at (E,); for burst_for (E,) decisions from burst_at (E,) the
-    picture is blurred by blur_px (E,)."""
+    """Disturbances of E episodes, with times counted in decisions. The feed is multiplied by `clog` (E,) from
+    `clog_at` (E,) on. The camera moves by `shift_px` (E, 2) at `shift_at` (E,). The picture is blurred by
+    `blur_px` (E,) for `burst_for` (E,) decisions from `burst_at` (E,)."""
 
     clog: np.ndarray
     clog_at: np.ndarray
@@ -104,13 +104,13 @@ class PixelDisturbances(NamedTuple):
 
 
 def calm(episodes: int) -> PixelDisturbances:
-    """Nothing befalls E episodes; `_replace` what is to."""
+    """Returns E episodes without disturbances. Add one with `_replace`."""
     zero, never = np.zeros(episodes), np.full(episodes, np.iinfo(int).max)
     return PixelDisturbances(zero + 1, never, np.zeros((episodes, 2)), never, zero, never, zero)
 
 
 def _filmed(frames: np.ndarray, d: PixelDisturbances, i: int, decision: int) -> np.ndarray:
-    """The frames (n, h, w) of episode i as a disturbed camera gives them."""
+    """Returns the frames (n, h, w) of episode i with the camera's disturbances."""
     burst = 0 <= decision - d.burst_at[i] < d.burst_for[i]
     h, w = frames.shape[1:]
     if burst and d.blur_px[i] > 0:
@@ -125,12 +125,12 @@ def _filmed(frames: np.ndarray, d: PixelDisturbances, i: int, decision: int) -> 
 
 
 class Episodes(NamedTuple):
-    """E episodes of D decisions. Truth: flow and temperature (E, D + 1), means over the window that each
-    decision was made on, and over one after the last.
+    """E episodes of D decisions. True `flow` and `temperature` (E, D + 1): means over the window on which
+    each decision was made, and over one window after the last decision.
 
-    Per decision (E, D): time_s at the window's end, setpoint and sent (E, D, 2) flow and target before, and
-    the change that was sent, windows (each field (E, D, ...)), segment number; clipped (E, 4) as in
-    actuation.Setpoints.
+    For each decision (E, D): `time_s` at the window's end; `setpoint` (E, D, 2), flow and target before;
+    `sent` (E, D, 2), the change that was sent; `windows`, each field (E, D, ...); `segment`, its number.
+    `clipped` (E, 4) as in actuation.Setpoints.
     """
 
     flow: np.ndarray
@@ -144,16 +144,16 @@ class Episodes(NamedTuple):
 
 
 class PixelLoop(NamedTuple):
-    """What is closed into a loop, and how it is deployed.
+    """The parts of the loop, and how it is deployed.
 
-    The machine; the classifier classify(images (n, 16, 48), temperature (n,)) -> class probabilities (n, 3),
-    out-of-distribution scores (n,), log(flow / 100 %) (n,) and its deviation (n,);
-    frames a window at frame_rate_hz, waits, limits, and the rule of the window, judge(P, valid, scores,
-    tip_moved, flows=) -> Window; the least ridge score of a key area, how far the nozzle may be from where
-    its tip was calibrated, and how long a segment's conditions last on average. window_flow(log_flow,
-    deviation, valid, looks), each (E, W), looks (E, measures), -> flow_seen, spread and class probabilities
-    of windows. foreign(looks) -> (E,) whether windows are of no camera that is known; None where the camera
-    cannot be judged, and all is held (`deployment.camera_guard`).
+    `classify(images (n, 16, 48), temperature (n,))`: returns class probabilities (n, 3), out-of-distribution
+    scores (n,), log(flow / 100 %) (n,) and its standard deviation (n,). `frames`: in a window, at
+    `frame_rate_hz`. `judge(P, valid, scores, tip_moved, flows=)`: the rule of the window, returns a
+    JudgedWindow. `least_score`: least ridge score of a key area. `tip_tolerance_px`: allowed distance of the
+    nozzle from its calibrated tip. `segment_mean_s`: mean duration of a segment's conditions.
+    `window_flow(log_flow, deviation, valid, looks)`, each (E, W), looks (E, measures): returns flow_seen,
+    spread and class probabilities of windows. `foreign(looks)`: (E,), whether windows come from an unknown
+    camera; None if the camera cannot be judged, and then nothing is sent (`deployment.camera_guard`).
     """
 
     machine: MachineDynamics
@@ -178,8 +178,8 @@ def _answer(
     keys: jax.Array,
     reason: np.ndarray,
 ) -> tuple[Any, np.ndarray]:
-    """Memory, and the change (E, 2) wanted of flow and target; the target's only where lambda's clock allows
-    it, none where the window is held."""
+    """Returns the memory and the requested change (E, 2) of flow and target. The target changes only when
+    lambda's clock allows it. Both are zero if the window does not allow an action."""
     shown = Observation(*(jnp.asarray(a, jnp.int32 if a.dtype.kind == "i" else jnp.float32) for a in shown))
     memory, (q, u) = _decided(controller, parameters, memory, shown, jnp.asarray(reason, jnp.int32), keys)
     wanted = np.stack(
@@ -196,8 +196,8 @@ _decided = eqx.filter_jit(jax.vmap(actuation.decide, (None, None, 0, 0, 0, 0)))
 
 
 class _Cameras(NamedTuple):
-    """The cameras of E episodes, changed in place: generators; the segments on the plate; templates of the
-    nozzles, cut from the first frames, where the tip was calibrated; when each segment ends (E,) in s, and
+    """The cameras of E episodes, changed in place: random generators; the segments on the plate; nozzle
+    templates, cut from the first frames, where the tip was calibrated; the end of each segment (E,) in s, and
     its number (E,)."""
 
     rngs: list[np.random.Generator]
@@ -217,12 +217,12 @@ def run(
     decisions: int,
     rng: np.random.Generator,
 ) -> Episodes:
-    """Episodes from the setpoints start (E, 2), at rest there.
+    """Simulates episodes that start at rest at the setpoints start (E, 2).
 
-    A window whose classes cannot be told apart is no reason to act, but it is evidence: the controller is
-    shown it and remembers, and its answer is not sent. Of windows held for another reason it hears nothing.
-    Lambda's clock counts the windows that were acted on, so that a hold does not cost the temperature its
-    action. Each episode draws from its own generator: what it meets does not depend on the others.
+    If a window must not be acted on (its reason is not ACTS), nothing is sent, and the controller's memory is
+    kept as it was. Lambda's clock counts only the windows that led to an action, so that a blocked window
+    does not cost the temperature its action. Each episode has its own random generator and does not depend on
+    the others. Raises ValueError if `disturbances` has another number of episodes.
     """
     E, tick_s = len(start), 1.0 / loop.frame_rate_hz
     if len(disturbances.clog) != E:
@@ -281,7 +281,7 @@ def run(
 
 
 def _judged(loop: PixelLoop, areas: "_WindowAreas", temperature: np.ndarray) -> JudgedWindow:
-    """What the windows of E episodes say, at the temperatures (E, W) of their frames."""
+    """Returns the judged windows of E episodes, at the temperatures (E, W) of their frames."""
     E = len(temperature)
     P, scores, *flows = loop.classify(areas.images.reshape(-1, *key_area.SHAPE), temperature.ravel())
     shown = P.reshape(E, -1, 3), areas.valid, scores.reshape(E, -1), areas.tip_moved
@@ -292,15 +292,15 @@ def _judged(loop: PixelLoop, areas: "_WindowAreas", temperature: np.ndarray) -> 
 def _filmed_window(
     loop: PixelLoop, state: Running, setpoint: np.ndarray, clog: np.ndarray, ticks: np.ndarray
 ):
-    """The machines after a wait of ticks (E,) and a window of frames, at setpoints (E, 2) with the flow times
-    clog (E,); flow and temperature (E, W) of each frame."""
+    """Returns the machines after a wait of `ticks` (E,) and a window of frames, at `setpoint` (E, 2) with the
+    flow times `clog` (E,); and flow and temperature (E, W) of each frame."""
     feed, target, tick_s = setpoint[:, 0] * clog, setpoint[:, 1], 1.0 / loop.frame_rate_hz
     state, _, _ = _advance(loop.machine, state, feed, target, ticks, tick_s)
     return _advance(loop.machine, state, feed, target, np.full(len(feed), loop.frames), tick_s)
 
 
 def _renew_segments(cameras: _Cameras, time_s: np.ndarray, segment_mean_s: float) -> None:
-    """A new segment where the old one has ended by time_s (E,)."""
+    """Starts a new segment if the old one has ended by time_s (E,)."""
     for i in np.flatnonzero(time_s > cameras.ends):
         cameras.segments[i] = _next_segment(cameras.segments[i], cameras.rngs[i])
         cameras.ends[i] = time_s[i] + cameras.rngs[i].exponential(segment_mean_s)
@@ -315,7 +315,7 @@ def _advance(
     ticks: np.ndarray,
     tick_s: float,
 ):
-    """The state after ticks (E,), and the flow and temperature (E, most) of each tick."""
+    """Returns the state after `ticks` (E,), and the flow and temperature (E, most) of each tick."""
     flows, temperatures = np.zeros((2, len(feed), ticks.max(initial=0)))
     for k in range(ticks.max(initial=0)):
         state, flows[:, k] = tick(machine, state, feed, target, k < ticks, tick_s=tick_s)
@@ -324,7 +324,8 @@ def _advance(
 
 
 def _next_segment(segment, rng: np.random.Generator):
-    """New conditions on the same machine: nozzle, calibrated tip and the plate's brightness stay."""
+    """Draws new conditions on the same machine: nozzle, calibrated tip and the plate's brightness are
+    kept."""
     new = nozzle_scene.draw_segment(rng)
     if segment is None:
         return new
@@ -334,8 +335,8 @@ def _next_segment(segment, rng: np.random.Generator):
 
 
 class _WindowAreas(NamedTuple):
-    """Key areas (E, W, 16, 48) uint8, whether they are valid (E, W), whether the nozzle is elsewhere than
-    where it was calibrated (E,), and how the windows look (E, measures)."""
+    """Key areas (E, W, 16, 48) uint8; whether they are valid (E, W); whether the nozzle has left its
+    calibrated place (E,); and the measures of the windows' looks (E, measures)."""
 
     images: np.ndarray
     valid: np.ndarray
@@ -351,7 +352,7 @@ def _window_areas(
     disturbances: PixelDisturbances,
     decision: int,
 ) -> _WindowAreas:
-    """What the cameras show of flow and temperature (E, W)."""
+    """Renders what the cameras see at flow and temperature (E, W), and cuts the key areas."""
     images, valid, moved, looks = [], [], [], []
     for i, segment in enumerate(cameras.segments):
         scene = nozzle_scene.render(segment, flow[i], temperature[i], cameras.rngs[i])
@@ -375,8 +376,8 @@ def _window_areas(
 
 
 def settled_since(episodes: Episodes) -> np.ndarray:
-    """The decision (E,) from which each episode is inside 90-110 % and 210 +- 5 °C, by the true flow, to its
-    end; D + 1 where it ends outside."""
+    """Returns the decision (E,) from which each episode keeps within 90-110 % true flow and 210 +- 5 °C to
+    its end; D + 1 if it ends outside."""
     inside = (np.abs(episodes.flow - 100.0) <= 10.0 + 1e-3) & (
         np.abs(episodes.temperature - 210.0) <= 5.0 + 1e-3
     )

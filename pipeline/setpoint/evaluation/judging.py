@@ -1,9 +1,9 @@
-"""Controllers of setpoints on one yardstick: what they are asked (21 wrong starts, clogs, good starts that
-shall stay good), on recorded segments, and the rule by which one of them runs by default.
+"""Compares setpoint controllers on the same cases (21 wrong starts, clogs, and good starts that must not be
+disturbed) on recorded segments, and chooses the default controller.
 
-Figures are of the segments that a classifier happened to record. These are parted into pools that share no
-segment, and each pool has as many runs: what the shares of the pools differ by, against what runs that share
-nothing would differ by, says how many runs the segments are worth (`effective`).
+The figures depend on which segments a classifier happened to record. So segments are divided into pools that
+share none, with equally many runs on each pool. The variation between pools, compared with that of
+independent runs, shows how many independent runs the segments are worth (`effective`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,16 +29,16 @@ from pipeline.setpoint.simulation.simulator import (
 )
 from pipeline.statistics import mean_of_pools, pooled_share
 
-GOOD_STARTS = np.linspace(92.5, 107.5, STARTS)  # percent: prints that nothing is wrong with
+GOOD_STARTS = np.linspace(92.5, 107.5, STARTS)  # percent: flows of good prints
 # scale and exponent: it shows 12 % more at 100 %, and ratios smaller than they are
 OTHER_CAMERA = (1.12, 0.8)
-# points within which two contestants are alike in their worst case
+# percentage points within which the worst cases of two controllers count as equal
 ALIKE_POINTS = 2.0
 
 
 class Case(NamedTuple):
-    """Conditions (n,), persistence 0 of the paper's windows. The camera shows 100 scale (q / 100)^exponent
-    percent for the flow q. good: from good starts, where harm is what counts."""
+    """Conditions (n,); persistence 0 selects the paper's windows. For the flow q the camera shows 100 scale
+    (q / 100)^exponent percent. `good`: runs begin at good starts, and disturbing them is what counts."""
 
     conditions: EpisodeConditions
     scale: float = 1.0
@@ -50,11 +50,10 @@ class Case(NamedTuple):
 
 
 def all_cases(runs: int, *, segment_mean_decisions: float) -> dict[str, Case]:
-    """Every case by name, `runs` from each of 21 starts: classes alone that are right with 70 %, on the
-    paper's simulator; then on recorded windows, fresh ones of which each is of a segment of its own, and
-    sticky ones whose segment lasts segment_mean_decisions; some clogged to 0.6 or 0.75 at step 60; then good
-    starts, with the camera right and with one of another scale.
-    """
+    """Returns every case by name, with `runs` from each of 21 starts. First, classes that are right in 70 %
+    of windows, on the paper's simulator. Then recorded windows: "fresh", with a new segment for each window,
+    and "sticky", with segments that last segment_mean_decisions. Some clog to a factor of 0.6 or 0.75 at step
+    60. Then good starts, with a correct camera and with a camera of another scale."""
     fresh = starts(runs, accuracy=0.7)
     one = jnp.ones_like(fresh.flow)
     lasting = {"persistence": segment_mean_decisions * one}
@@ -76,12 +75,13 @@ def all_cases(runs: int, *, segment_mean_decisions: float) -> dict[str, Case]:
 
 
 def counts(case: str) -> bool:
-    """Whether a case is of the wrong starts, by which controllers are ranked; the good ones tell harm."""
+    """Returns whether a case begins at wrong starts. Controllers are ranked by those; good starts show
+    harm."""
     return not case.startswith(("perfect", "in band"))
 
 
 class DistortedWindows(NamedTuple):
-    """recorded windows and how the camera maps the flow that they show."""
+    """Recorded windows, and how the camera changes the flow that they show."""
 
     recorded: WindowSource
     scale: jax.Array
@@ -89,8 +89,8 @@ class DistortedWindows(NamedTuple):
 
 
 def shown_by(recorded: WindowSource, case: Case) -> WindowSource:
-    """The windows of this case: those of the paper where conditions.persistence is 0, else recorded ones at
-    the flow that the camera makes of the true one. One program for all of them."""
+    """Returns the windows of this case: the paper's if conditions.persistence is 0, else recorded ones at the
+    flow that the camera shows for the true one. One compiled program serves all cases."""
     return WindowSource(
         _shown, DistortedWindows(recorded, jnp.float32(case.scale), jnp.float32(case.exponent))
     )
@@ -107,16 +107,17 @@ def _shown(table: DistortedWindows, conditions: EpisodeConditions, flow, segment
 
 
 def pools(tables: Sequence[WindowTable], size: int) -> list[list[WindowSource]]:
-    """For each table its pools of `size` segments that share none, or of fewer, so that each table has two:
-    sources that differ by the misreadings of their segments alone, and are one program. A table of classes
-    only is one pool: nothing tells what its segments weigh."""
+    """Divides each table's segments into pools of `size` that share none; `size` is reduced if needed, so
+    that each table has at least two. The sources differ only in the errors of their segments and share one
+    compiled program. A table with classes only is one pool, because the errors of its segments are
+    unknown."""
     sources = [recorded_windows(table) for table in tables]
     arrays = [{name: np.asarray(a) for name, a in source.table._asdict().items()} for source in sources]
     room = {name: max(len(own[name]) for own in arrays) for name in arrays[0]}
     size = max(min(size, *(len(own["bias"]) // 2 for own in arrays)), 1)
 
     def filled(name: str, a: np.ndarray) -> np.ndarray:
-        # what is filled up is never drawn: no flow lies beyond infinity, and `seen` says where windows end
+        # padding is never drawn: no flow lies beyond infinity, and `seen` gives the number of real windows
         fill = np.inf if name == "log_flow" else 0
         return np.pad(a, [(0, room[name] - len(a)), *[(0, 0)] * (a.ndim - 1)], constant_values=fill)
 
@@ -134,7 +135,7 @@ def pools(tables: Sequence[WindowTable], size: int) -> list[list[WindowSource]]:
 
 
 class Runs(NamedTuple):
-    """Flow and temperature, (P, n, STEPS + 1) of n runs on each of P pools; the start is the first."""
+    """Flow and temperature (P, n, STEPS + 1) of n runs on each of P pools; the start comes first."""
 
     flow: np.ndarray
     temperature: np.ndarray
@@ -147,7 +148,8 @@ def simulate(
     segments: Sequence[WindowSource],
     key: jax.Array,
 ) -> Runs:
-    """The case's runs (n,) on each pool of `pools`. The same key, the same chance for every controller."""
+    """Simulates the runs (n,) of a case on each pool of `pools`. With the same key every controller gets the
+    same random numbers."""
     trajectories = [
         _simulated(controller, parameters, shown_by(pool, case), case.conditions, jax.random.fold_in(key, k))
         for k, pool in enumerate(segments)
@@ -162,7 +164,7 @@ def _simulated(controller, parameters, windows: WindowSource, conditions: Episod
 
 
 def become(of: Runs) -> Outcomes:
-    """What becomes of all runs, pool by pool (P n,)."""
+    """Returns the outcomes of all runs, pool by pool (P n,)."""
     return outcomes(*(a.reshape(-1, STEPS + 1) for a in of))
 
 
@@ -170,8 +172,9 @@ def become(of: Runs) -> Outcomes:
 
 
 class DefaultChoice(NamedTuple):
-    """The default; worst: the share of its runs (percent) that settle and stay in its worst case, on segments
-    that it was not chosen on; refused: who may not run, and why; sentence: why it is the default."""
+    """The default controller. `worst`: percentage of its runs that reach and keep the target in its worst
+    case, on segments not used to choose it. `refused`: controllers that may not run, each with the reason.
+    `sentence`: why it is the default."""
 
     name: str
     worst: float
@@ -186,9 +189,12 @@ Judged = Mapping[str, Outcomes]  # what became of one controller's runs, by case
 def choose(
     judged: Mapping[str, Judged], segments: int, *, simplest_first: Sequence[str], bars: Mapping[str, float]
 ) -> DefaultChoice:
-    """The default: of the contestants that do no harm the simplest whose worst case lies within ALIKE_POINTS
-    of the best. Who leaves +-25 % from good starts surely more often than bars[case] percent does harm; runs
-    are on so many pools of segments. Raises ValueError if all do harm."""
+    """Returns the default controller: among those that disturb good prints no more than allowed, the simplest
+    whose worst case lies within ALIKE_POINTS of the best.
+
+    A controller is refused if, from good starts, it leaves +-25 % significantly more often than bars[case]
+    percent. `segments`: number of pools that the runs are on. Raises ValueError if all are refused.
+    """
     refused = {name: why for name, of in judged.items() if (why := harmful(of, segments, bars))}
     worst = {
         name: worst_case(judged[name]) for name in simplest_first if name in judged and name not in refused
@@ -211,13 +217,15 @@ def choose(
 
 
 def worst_case(judged: Judged) -> tuple[float, str]:
-    """The least percent of runs that settle and stay, and where; of two alike the first case."""
+    """Returns the lowest percentage of runs that reach and keep the target, and its case; of equal ones the
+    first."""
     shares = [(100.0 * float(of.stay.mean()), case) for case, of in judged.items() if counts(case)]
     return min(shares, key=lambda pair: pair[0])
 
 
 def harmful(judged: Judged, segments: int, bars: Mapping[str, float]) -> str:
-    """Where a contestant surely leaves +-25 % more often than its bar; else ""."""
+    """Returns in which case a controller leaves +-25 % significantly more often than its limit, in words;
+    else ""."""
     for case, bar in bars.items():
         share = pooled_share(judged[case].beyond[:, -1].reshape(segments, -1))
         if share.low > bar:
@@ -226,17 +234,17 @@ def harmful(judged: Judged, segments: int, bars: Mapping[str, float]) -> str:
 
 
 def harm_limits(cases: Sequence[str], *, perfect: float, in_band: float) -> dict[str, float]:
-    """Percent of runs that may leave +-25 % by case. With a camera of another scale harm is reported and bars
-    nobody: no rule can know better."""
+    """Returns, by case, the percentage of runs that may leave +-25 %. With a camera of another scale harm is
+    reported but has no limit, because no controller can detect the scale."""
     limits = {name: harm_bar(name, perfect=perfect, in_band=in_band) for name in cases}
     return {name: limit for name, limit in limits.items() if limit is not None}
 
 
 def compare(judged: Mapping[str, Judged], pools: int, *, segments: int) -> dict[str, Any]:
-    """The first model-based controller (a) against the first data-driven one (b): by how many points more of
-    the runs of a settle and stay, on average over the cases from wrong starts, with its 90 % interval: same
-    pools, same chance, run by run. winner: None if zero lies inside; needed: how many more segments would
-    tell, None if told or if no number would."""
+    """Compares the first model-based controller (a) with the first data-driven one (b). `difference`: by how
+    many points more runs of a reach and keep the target, averaged over the cases from wrong starts, with its
+    90 % interval. Both have the same pools and random numbers, run by run. `winner`: None if the interval
+    contains zero. `needed`: how many more segments would decide; None if decided, or if no number would."""
     a, b = of_kind("model-based"), of_kind("data-driven")
     pair: dict[str, Any] = {"a": a, "b": b, "cases": 0, "segments": segments}
     if pools < 2 or not {a, b} <= judged.keys():

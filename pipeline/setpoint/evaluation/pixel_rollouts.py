@@ -1,4 +1,4 @@
-"""Episodes of the closed loop through rendered frames: from where they start, and what befalls them."""
+"""Episodes of the closed loop through rendered frames: their starts and their disturbances."""
 
 from typing import NamedTuple
 
@@ -7,20 +7,20 @@ import numpy as np
 from pipeline.setpoint.agents import trials
 from pipeline.setpoint.deployment import pixels
 
-# decisions at the end of an episode that it must be inside for, to count as settled
+# decisions at the end of an episode during which it must keep the target, to count as settled
 DWELL = 10
 
 
 class PixelRollouts(NamedTuple):
-    """Episodes through pixels; nothing if none were simulated."""
+    """Episodes through rendered frames; empty if none were simulated."""
 
     calm: dict[str, pixels.Episodes]  # undisturbed ones by controller
-    disturbed: pixels.Episodes | None  # two of the default
-    words: tuple[str, ...]  # what befalls these two
+    disturbed: pixels.Episodes | None  # two episodes of the default controller
+    words: tuple[str, ...]  # the disturbances of these two
 
 
 def spread_starts(count: int, runs: int) -> np.ndarray:
-    """(E, 2) flow in percent and temperature in °C: `count` of the 21 starts, spread over flows and
+    """Returns flow in percent and temperature in °C (E, 2): `count` of the 21 starts, spread over flows and
     temperatures, `runs` times each."""
     starts = trials.starts(1, accuracy=1.0)
     chosen = np.unique(np.linspace(0, 20, count).round().astype(int))
@@ -32,7 +32,7 @@ def spread_starts(count: int, runs: int) -> np.ndarray:
 
 
 def disturbed_episodes(decisions: int) -> tuple[np.ndarray, pixels.PixelDisturbances, tuple[str, str]]:
-    """Starts (2, 2), disturbances and words of the two episodes that the page shows, whatever comes of them:
+    """Returns starts (2, 2), disturbances and descriptions of the two episodes that the page always shows:
     the hardest start, and a clog with pictures out of focus later."""
     D, never = decisions, np.iinfo(int).max
     disturbances = pixels.calm(2)._replace(

@@ -1,4 +1,4 @@
-"""What was judged as tables and figures: columns of schemas SCOREBOARD, PATHS and DECISIONS."""
+"""Turns test results into tables and figures: columns of schemas SCOREBOARD, PATHS and DECISIONS."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -16,27 +16,29 @@ from pipeline.setpoint.evaluation.pixel_rollouts import DWELL, PixelRollouts
 from pipeline.setpoint.simulation import actuation
 from pipeline.statistics import PooledShare, wilson
 
-# the cases of which runs of every controller are kept beside the deciding one, and so many decisions of them
+# cases whose runs are stored for every controller besides the deciding case, and their number of decisions
 PATHS_OF, PATH_STEPS = ("accuracy 0.7", "recorded, sticky"), 100
 
 
 class Contest(NamedTuple):
-    """Every controller on the segments that are read once, by name: its scores by case, and of the cases that
-    count the first run from each start."""
+    """Results of every controller, by name, on the test segments, which are used once: `scores` by case, and
+    `paths`, the first run from each start of the cases that count."""
 
     scores: dict[str, dict[str, RunScore]]
     paths: dict[str, dict[str, Runs]]
 
 
 def simulator(case: str) -> str:
-    """Whose windows a case has: paper or recorded; harm, recorded ones from good starts."""
+    """Returns the source of a case's windows: "paper", "recorded", or "harm" for recorded windows from good
+    starts."""
     if not judging.counts(case):
         return "harm"
     return "recorded" if case.startswith("recorded") else "paper"
 
 
 def scores(judged: Mapping[str, judging.Judged], pools: int) -> dict[str, dict[str, RunScore]]:
-    """By name and case; on the paper's simulator runs share nothing."""
+    """Returns scores by name and case. On the paper's simulator all runs are independent, so there are no
+    pools."""
     return {
         name: {
             case: summary(outcomes, pools=None if simulator(case) == "paper" else pools)
@@ -47,7 +49,7 @@ def scores(judged: Mapping[str, judging.Judged], pools: int) -> dict[str, dict[s
 
 
 def first_of_each(of: Runs) -> Runs:
-    """The first run (21, STEPS + 1) from each of the `starts`, on the first pool."""
+    """Returns the first run (21, STEPS + 1) from each of the `starts`, on the first pool."""
     shape = len(START_FLOWS), -1, len(START_TEMPERATURES), STEPS + 1
     return Runs(*(a[0].reshape(shape)[:, 0].reshape(STARTS, STEPS + 1).copy() for a in of))
 
@@ -92,7 +94,7 @@ def _score_row(name: str, case: str, score: RunScore) -> dict[str, Any]:
 
 
 def _ends(key: str, share: PooledShare | None) -> dict[str, float]:
-    """The four columns of a share, missing where it is none."""
+    """Returns the four columns of a share; NaN if there is none."""
     values = (np.nan,) * 4 if share is None else share
     names = (f"{key}_percent", f"{key}_low_percent", f"{key}_high_percent", f"{key}_n_eff")
     return dict(zip(names, values, strict=True))
@@ -103,8 +105,8 @@ def _columns(rows: list[dict[str, Any]]) -> dict[str, list]:
 
 
 def paths(contest: Contest, choice: DefaultChoice, rollouts: PixelRollouts) -> dict[str, Any]:
-    """Columns of schema PATHS: one run from each of the 21 starts, of those judged: PATH_STEPS decisions of
-    the cases PATHS_OF, STEPS of the choice's case, which decides. And the runs through pixels."""
+    """Returns columns of schema PATHS: one run from each of the 21 starts. These are PATH_STEPS decisions of
+    the cases PATHS_OF, STEPS decisions of the case that decided the choice, and the runs through pixels."""
     pieces = []
     for case in dict.fromkeys((*PATHS_OF, choice.case)):
         last = STEPS if case == choice.case else PATH_STEPS
@@ -127,7 +129,8 @@ def paths(contest: Contest, choice: DefaultChoice, rollouts: PixelRollouts) -> d
 
 
 def _pixel_row(name: str, case: str, episodes: pixels.Episodes) -> dict[str, Any]:
-    """A row of schema SCOREBOARD: settled is inside to the end from at least DWELL decisions before it."""
+    """Returns a row of schema SCOREBOARD. An episode is settled if it keeps the target to its end, for at
+    least DWELL decisions."""
     since, runs, last = pixels.settled_since(episodes), len(episodes.flow), episodes.flow.shape[1] - 1
     settled = since <= last - DWELL
     share = PooledShare(*wilson(settled), len(settled))
@@ -158,7 +161,7 @@ def _pixel_row(name: str, case: str, episodes: pixels.Episodes) -> dict[str, Any
 
 
 def decisions(name: str, rollouts: PixelRollouts) -> dict[str, list]:
-    """Columns of schema DECISIONS: the two disturbed episodes."""
+    """Returns columns of schema DECISIONS for the disturbed episodes; nothing if there are none."""
     rows, episodes = [], rollouts.disturbed
     if episodes is None:
         return {}
@@ -193,7 +196,8 @@ def decisions(name: str, rollouts: PixelRollouts) -> dict[str, list]:
 def metrics(
     contest: Contest, choice: DefaultChoice, pair: Mapping[str, Any], rollouts: PixelRollouts
 ) -> dict[str, Any]:
-    """By controller, simulator and case; then the default, its cases and what it does to good prints."""
+    """Returns figures by controller, simulator and case; then the default controller, its cases, and how it
+    disturbs good prints."""
     figures: dict[str, Any] = {
         name: {
             source: {
@@ -226,7 +230,8 @@ def metrics(
 
 
 def _shares(case: str, score: RunScore) -> dict[str, float | int | None]:
-    """Of a case of the default: low and high are the ends of the 95 % interval of the runs that stay."""
+    """Returns the figures of the default controller in one case. `low` and `high`: 95 % interval of the runs
+    that keep the target."""
     figures: dict[str, float | int | None] = {
         "runs": score.runs,
         "settled": score.settled.percent,
@@ -245,7 +250,8 @@ def _shares(case: str, score: RunScore) -> dict[str, float | int | None]:
 
 
 def _harm(score: RunScore) -> dict[str, float | int]:
-    """Percent of runs from good starts that leave +-10, 15 and 25 % within 200 decisions, with intervals."""
+    """Returns the percentages of runs from good starts that leave +-10, 15 and 25 % within 200 decisions,
+    with intervals."""
     named = {f"beyond_{points}": share for points, share in zip(BEYOND, score.beyond, strict=True)}
     return (
         {"runs": score.runs}

@@ -1,10 +1,10 @@
-"""Whether a camera's pictures are of the kind that the classifier learned: measures of the whole crop and of
-the ground beside the bead, a window at a time, and how rarely a familiar window looks so.
+"""Tests if a camera's pictures resemble those that the classifier learned from. Measures the whole crop and
+the ground beside the bead, for each window, and gives a p-value: how rarely a familiar window looks so
+unusual.
 
-A network that is trained for the width of a bead is made blind to much else, and its input, equalised and
-cut to the bead, has lost the rest: a printer that it never saw looks ordinary to it. What tells printers
-apart lies around the bead: light, focus, noise, texture, and how far the bead's own profile is that of a
-line.
+A network trained for the width of a bead learns to ignore much else, and its input, equalised and cut to the
+bead, has lost the rest. So pictures of an unfamiliar printer look ordinary to it. Printers differ around the
+bead: in light, focus, noise, texture, and in how far the bead's profile is that of a line.
 """
 
 import functools
@@ -22,11 +22,11 @@ LEVELS = (1, 5, 25, 50, 75, 95, 99)  # percentiles of gray levels of the crop
 OCTAVES = 5
 # the strip beside the bead, in px across the line; the bead and its edges lie within REACH
 NEAR, REACH, START = 14, 28, 12
-# a frame's measures vary with its bead; a window's are the medians of a few: of so many that are spread over
-# it, or of the first accepted of every so many
+# a frame's measures vary with its bead, so a window's are the medians of a few frames: of FRAMES spread over
+# it, or of the first accepted frame of every MEASURED
 FRAMES, MEASURED = 4, 5
-# of windows of the known camera, the share that may be called foreign; pictures of other machines lie so far
-# off that it may be small
+# fraction of the known camera's windows that may be called foreign; it can be small, because pictures of
+# other machines differ so much
 FALSE_ALARMS = 0.01
 NAMES = (
     *(f"gray level, {p} %" for p in LEVELS),
@@ -48,11 +48,11 @@ NAMES = (
 
 
 def surroundings(gray: np.ndarray, angle_deg: float, miss_px: float) -> np.ndarray:
-    """(measures,) of NAMES of a crop (350, 350) uint8 with the tip in its middle, and of the line that leaves
-    it at angle_deg and passes beside it by miss_px.
+    """Returns the measures of NAMES (measures,) of a crop (350, 350) uint8 with the tip in its middle. The
+    line leaves the tip at `angle_deg` and passes beside it by `miss_px`.
 
-    Structure is the standard deviation of the octaves of a Laplacian pyramid (Burt and Adelson 1983), noise
-    that of Immerkaer (1996), both as log(1 + .) of gray levels of 8 bits, as are grain and contrast.
+    Structure is the standard deviation of each octave of a Laplacian pyramid (Burt and Adelson 1983); noise
+    is after Immerkaer (1996). Both, and grain and contrast, are log(1 + .) of gray levels of 8 bits.
     """
     counts = np.cumsum(cv2.calcHist([gray], [0], None, [256], [0, 256]).ravel())
     levels = np.searchsorted(counts, np.array(LEVELS) / 100 * counts[-1]).astype(float)
@@ -76,7 +76,7 @@ _IMMERKAER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 
 
 def _octaves(gray: np.ndarray, count: int) -> np.ndarray:
-    """(count,) standard deviations of the levels of a Laplacian pyramid."""
+    """Returns the standard deviations (count,) of the levels of a Laplacian pyramid."""
     stds = np.empty(count)
     for k in range(count):
         lower = cv2.pyrDown(gray)
@@ -87,8 +87,9 @@ def _octaves(gray: np.ndarray, count: int) -> np.ndarray:
 
 
 def _strips(gray: np.ndarray, angle_deg: float, miss_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """The ground on both sides of the line, one below the other (2 (REACH - NEAR), LENGTH - START), and all
-    that lies within REACH (2 REACH, LENGTH - START): rows across the line, columns from the tip outward."""
+    """Returns the ground on both sides of the line, stacked (2 (REACH - NEAR), LENGTH - START), and
+    everything within REACH (2 REACH + 1, LENGTH - START). Rows run across the line, columns from the tip
+    outward."""
     a = np.deg2rad(angle_deg)
     along, across = np.array([np.cos(a), np.sin(a)]), np.array([-np.sin(a), np.cos(a)])
     origin = SIDE // 2 + START * along + (miss_px - REACH) * across
@@ -104,8 +105,8 @@ def _strips(gray: np.ndarray, angle_deg: float, miss_px: float) -> tuple[np.ndar
 
 
 def _ground(beside: np.ndarray) -> list[float]:
-    """Level of the darker and the brighter side, asinh of the fall from the tip outward over 5 gray levels,
-    grain across and along."""
+    """Returns the level of the darker and of the brighter side; asinh(fall / 5), with the fall from the tip
+    outward in gray levels; and the grain across and along."""
     half = len(beside) // 2
     sides = sorted((float(beside[:half].mean()), float(beside[half:].mean())))
     x = beside.astype(np.float32)
@@ -116,9 +117,9 @@ def _ground(beside: np.ndarray) -> list[float]:
 
 
 def _bead(turned: np.ndarray) -> list[float]:
-    """Contrast of the mean profile across the line, its steepest edge over its contrast, what a line of one
-    width and height leaves of it, and how unlike its near and its far half are; the last three are shares
-    of the contrast."""
+    """Returns, for the mean profile across the line: its contrast; its steepest edge; the log of the residual
+    left by the best line of one width and height; and the log of the difference between its near and far
+    halves. The last three are relative to the contrast."""
     profile = turned.astype(np.float32).mean(axis=1)
     ground = np.median(np.r_[profile[: REACH - NEAR], profile[-(REACH - NEAR) :]])
     height = profile - ground
@@ -135,8 +136,8 @@ def _bead(turned: np.ndarray) -> list[float]:
 
 @functools.cache
 def _lines() -> np.ndarray:
-    """(shapes, 2 REACH + 1) profiles of unit norm of soft-edged lines: widths of 3 to 40 px, places within 8
-    px of the middle, edges of 1 and 2.5 px."""
+    """Returns profiles of unit norm (shapes, 2 REACH + 1) of soft-edged lines: widths of 3 to 40 px, places
+    within 8 px of the middle, edges of 1 and 2.5 px."""
     t = np.arange(2 * REACH + 1) - REACH
     shapes = [
         1 / (1 + np.exp(np.clip((np.abs(t - place) - width / 2) / soft, -50, 50)))
@@ -154,8 +155,8 @@ def _lines() -> np.ndarray:
 def of_window(
     frames: Sequence[np.ndarray] | np.ndarray, tips: np.ndarray, areas: KeyAreas, *, count: int = FRAMES
 ) -> np.ndarray:
-    """(measures,) medians over `count` valid frames spread over a window, with the tips (n, 2), or one for
-    all (2,); NaN where none is valid: there is no line beside which to look."""
+    """Returns the medians (measures,) over `count` valid frames spread over a window. `tips`: (n, 2), or (2,)
+    for all. NaN if no frame is valid, because without a line there is no place to measure beside it."""
     valid = np.flatnonzero(areas.valid)
     if not len(valid):
         return np.full(len(NAMES), np.nan)
@@ -178,8 +179,8 @@ def of_window(
 def of_frames(
     frames: np.ndarray, tip: tuple[float, float], areas: KeyAreas, *, least_score: float
 ) -> np.ndarray:
-    """(n, measures) float32 of the first of every MEASURED frames (n, height, width) that has a line of
-    least_score gray levels; NaN of the others."""
+    """Returns measures (n, measures) float32. Of every MEASURED frames (n, height, width) with a valid key
+    area and a line of at least `least_score` gray levels, the first is measured; the other rows are NaN."""
     looks = np.full((len(frames), len(NAMES)), np.nan, np.float32)
     clear = np.flatnonzero(areas.valid & (areas.score >= least_score))
     for i in clear[np.unique(clear // MEASURED, return_index=True)[1]]:
@@ -189,8 +190,8 @@ def of_frames(
 
 
 def windows(segment: np.ndarray, *, length: int) -> np.ndarray:
-    """Rows (w, length): every `length` frames of one segment or print in the order in which they come, none
-    used twice. A window may straddle a change of flow: its truth is that of its middle frame."""
+    """Returns rows (w, length): every `length` successive frames of one segment or print, none used twice. If
+    the flow changes within a window, its true flow is that of the middle frame."""
     segment = np.asarray(segment)
     order = np.argsort(segment, kind="stable")
     rows = [
@@ -202,21 +203,22 @@ def windows(segment: np.ndarray, *, length: int) -> np.ndarray:
 
 
 def medians(measures: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(w, measures) of windows with the frames `rows` (w, length) of `measures` (n, measures); NaN where none
-    of a window's was measured."""
+    """Returns medians (w, measures) of the windows with the frames `rows` (w, length) of `measures` (n,
+    measures); NaN if no frame of a window was measured."""
     looks = [median(measures[some].astype(float)) for some in rows]
     return np.array(looks).reshape(len(rows), measures.shape[1])
 
 
 def median(rows: np.ndarray) -> np.ndarray:
-    """(measures,) of a window's frames (n, measures), those without measures (NaN) left out."""
+    """Returns the median (measures,) of a window's frames (n, measures). Frames without measures (NaN) are
+    left out."""
     rows = rows[np.isfinite(rows).all(axis=1)]
     return np.median(rows, axis=0) if len(rows) else np.full(rows.shape[1], np.nan)
 
 
 class KnownCamera(NamedTuple):
-    """How windows of a known camera look: mean and deviation (f,), whitening (f, f) with which the measures
-    in deviations have unit covariance, and the scores (n,), rising, of windows of other segments."""
+    """How windows of a known camera look: `mean` and `deviation` (f,); `whitening` (f, f), which gives the
+    scaled measures unit covariance; `scores` (n,), ascending, of windows of other segments."""
 
     mean: np.ndarray
     deviation: np.ndarray
@@ -225,15 +227,16 @@ class KnownCamera(NamedTuple):
 
 
 def needed_windows(false_alarms: float) -> int:
-    """Windows by which a camera is known: half of them give p-values down to false_alarms."""
+    """Returns the number of windows needed to know a camera, so that half of them give p-values down to
+    `false_alarms`."""
     return 2 * int(np.ceil(1 / false_alarms - 1e-9))
 
 
 def fit_camera(windows: np.ndarray, segment: np.ndarray, *, false_alarms: float) -> KnownCamera:
-    """The camera of windows (n, f) of segments (n,): every other segment gives mean and covariance (shrunk:
-    Ledoit and Wolf 2004), the others the scores, one each, the largest of its windows'.
+    """Fits the camera to windows (n, f) of segments (n,). Every other segment gives mean and covariance
+    (shrunk: Ledoit and Wolf 2004). Each remaining segment gives one score, the largest of its windows.
 
-    Raises ValueError where the others are too few for a p-value of false_alarms.
+    Raises ValueError if there are too few segments for a p-value of `false_alarms`.
     """
     windows, segment = np.asarray(windows, float), np.asarray(segment)
     sound = np.isfinite(windows).all(axis=1)
@@ -247,7 +250,7 @@ def fit_camera(windows: np.ndarray, segment: np.ndarray, *, false_alarms: float)
         )
     learned = windows[np.isin(segment, names[::2])]
     mean, deviation = learned.mean(axis=0), learned.std(axis=0) + 1e-6
-    # here, as whoever renders, watches or controls fits none, and it takes longer to import than all else
+    # imported here, because only this function needs it, and it takes longer to import than everything else
     from sklearn.covariance import LedoitWolf
 
     covariance = LedoitWolf().fit((learned - mean) / deviation).covariance_
@@ -259,28 +262,33 @@ def fit_camera(windows: np.ndarray, segment: np.ndarray, *, false_alarms: float)
 
 
 def score(camera: KnownCamera, windows: np.ndarray) -> np.ndarray:
-    """(n,) how far windows (n, f) are from the camera's: z' C^-1 z + mean of z^4, z in deviations. The first
-    is large where measures do not go together, the second where one alone is far outside."""
+    """Returns the distance (n,) of windows (n, f) from those of the camera: z' C^-1 z + mean of z^4, with z
+    in standard deviations. The first term is large if measures do not fit together, the second if a single
+    one is far off."""
     z = (np.asarray(windows, float) - camera.mean) / camera.deviation
     return ((z @ camera.whitening.T) ** 2).sum(axis=1) + (z**4).mean(axis=1)
 
 
 def p_value(camera: KnownCamera, windows: np.ndarray) -> np.ndarray:
-    """(n,) how rarely a window of this camera is as unlike the others: (1 + those at least as far) / (1 + n),
-    conformal (Vovk, Gammerman and Shafer 2005); at most a share p of new segments has p or less. NaN for a
-    window without a valid frame."""
+    """Returns the conformal p-value (n,) of windows (n, f) (Vovk, Gammerman and Shafer 2005):
+
+        p = (1 + number of scores at least as large) / (1 + n scores)
+
+    At most a fraction p of new segments has p or less. NaN for a window without a valid frame.
+    """
     far = score(camera, windows)
     beyond = len(camera.scores) - np.searchsorted(camera.scores, far, side="left")
     return np.where(np.isfinite(far), (1 + beyond) / (1 + len(camera.scores)), np.nan)
 
 
 def foreign(camera: KnownCamera, windows: np.ndarray, *, false_alarms: float) -> np.ndarray:
-    """(n,) whether windows (n, f) are of no camera that is known; not where there is none to be judged."""
+    """Returns whether windows (n, f) come from an unknown camera (n,) bool; false if a window has no
+    measures."""
     return p_value(camera, windows) <= false_alarms
 
 
 def unlike(camera: KnownCamera, window: np.ndarray) -> str:
-    """In words what is furthest from what the camera's windows have."""
+    """Returns, in words, the measure that differs most from the camera's windows."""
     z = (np.asarray(window, float) - camera.mean) / camera.deviation
     k = int(np.abs(z).argmax())
     return f"{NAMES[k]}: {abs(z[k]):.0f} deviations {'above' if z[k] > 0 else 'below'} the known camera's"
@@ -289,9 +297,12 @@ def unlike(camera: KnownCamera, window: np.ndarray) -> str:
 def fit_recorded_camera(
     surroundings: np.ndarray, segment: np.ndarray, *, length: int
 ) -> tuple[KnownCamera | None, int]:
-    """The camera of frames with `surroundings` (n, measures), by windows of `length` of them in a row in one
-    stretch `segment` (n,) of constant settings; and the number of windows. What errs together is such a
-    stretch; if these are too few, a window; no camera if those are too few as well."""
+    """Returns the camera of recorded frames, and the number of windows. `surroundings` (n, measures);
+    `segment` (n,): stretch of constant settings; windows have `length` successive frames of one stretch.
+
+    Windows of one stretch err together, so stretches are the independent units. If there are too few of them,
+    single windows are; if these are too few as well, there is no camera (None).
+    """
     windows, stretch = window_medians(surroundings, segment, length=length)
     for together in (stretch, np.arange(len(windows))):
         try:
@@ -304,7 +315,8 @@ def fit_recorded_camera(
 def window_medians(
     surroundings: np.ndarray, segment: np.ndarray, *, length: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(measures of the windows (w, f), stretch of each (w,)), of those with a measured frame."""
+    """Returns the measures of the windows (w, f) and the stretch of each (w,), for windows with a measured
+    frame."""
     segment = np.asarray(segment)
     rows = windows(segment, length=length)
     looks = medians(surroundings, rows)

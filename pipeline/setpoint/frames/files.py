@@ -1,4 +1,5 @@
-"""The camera that the classifier was made for, and rendered frames with their labels, to files and back."""
+"""Stores the camera that the classifier was made for, and rendered frames with their labels, in files, and
+restores them."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ FRAMES_SCHEMA = "frames 2"
 
 
 def store_camera(path: Path, camera: KnownCamera | None) -> None:
-    """Writes the camera; empty arrays where there is none."""
+    """Writes the camera; empty arrays if there is none."""
     mean, deviation, whitening, scores = camera or KnownCamera(*(np.zeros(0) for _ in KnownCamera._fields))
     units = "1", "as the measures of familiar.NAMES"
     artifacts.write_arrays(
@@ -31,8 +32,8 @@ def store_camera(path: Path, camera: KnownCamera | None) -> None:
 
 
 def restore_camera(path: str | Path) -> KnownCamera | None:
-    """What `store_camera` wrote, None where there was no camera. Raises ValueError for a file of other
-    measures."""
+    """Returns the camera that `store_camera` wrote; None if there was none. Raises ValueError if the file has
+    other measures."""
     arrays = artifacts.read_arrays(str(path), *CAMERA_SCHEMA)
     if not arrays["scores"].size:
         return None
@@ -45,7 +46,8 @@ def restore_camera(path: str | Path) -> KnownCamera | None:
 
 
 def store_frames(folder: Path, by_part: dict[str, LabelledFrames]) -> None:
-    """<part>.safetensors of each part; of the reasons only that there is one."""
+    """Writes <part>.safetensors of each part. The texts of the reasons are not stored, only whether a frame
+    is valid."""
     for part, frames in by_part.items():
         arrays = frames._asdict()
         del arrays["reasons"]
@@ -53,7 +55,7 @@ def store_frames(folder: Path, by_part: dict[str, LabelledFrames]) -> None:
 
 
 def restore_frames(folder: Path, parts: Sequence[str]) -> dict[str, LabelledFrames]:
-    """These parts as `store_frames` wrote them."""
+    """Returns these parts as `store_frames` wrote them, with one common reason for rejected frames."""
     by_part = {}
     for part in parts:
         arrays, _ = artifacts.read_weights(folder / f"{part}.safetensors", FRAMES_SCHEMA)

@@ -1,5 +1,5 @@
-"""Frames of one film -> key areas: the crop round the tip, the direction of the line as far as it is known or
-can be seen in the motion of the ground, and why a frame has none."""
+"""Turns the frames of one film into key areas: the crop around the tip, the direction of the line if it is
+known or visible in the motion of the ground, and the reason if a frame has no key area."""
 
 import itertools
 from collections.abc import Iterable, Sequence
@@ -9,9 +9,9 @@ import numpy as np
 
 from pipeline.setpoint.frames import familiar, key_area, travel
 
-# frames among which the ground's motion is sought at a time
+# successive frames that are searched together for the ground's motion
 IN_A_ROW = 20
-# cameras of 10 and 12 bits may leave the upper ones of 16 empty; a picture as dark as that
+# cameras of 10 and 12 bits may leave the upper bits of 16 empty; a picture as dark as that
 # has fewer than 16 of 256 gray levels in any case
 FILLED_BITS = 12
 NO_TIP, UNUSABLE, SEVERAL = "no tip is known", "the frame cannot be used", "several lines"
@@ -25,10 +25,10 @@ REMEDIES = {
 
 
 class FrameKeyAreas(NamedTuple):
-    """What the front end made of n frames: images (n, 16, 48) uint8, zeros where rejected; angle_deg,
-    miss_px, score, padded_share (n,), NaN where nothing was looked at; tip (n, 2) in px; surroundings (n,
-    measures) float32 of the first accepted of every familiar.MEASURED frames, NaN of the others; n reasons,
-    empty where there is a key area; n digests of what the frame held."""
+    """The front end's results for n frames: `images` (n, 16, 48) uint8, zeros if rejected; `angle_deg`,
+    `miss_px`, `score`, `padded_share` (n,), NaN if the frame was not searched; `tip` (n, 2) in px;
+    `surroundings` (n, measures) float32 of the first accepted of every familiar.MEASURED frames, NaN for the
+    others; n `reasons`, empty if there is a key area; n `digests` of the frames' content."""
 
     images: np.ndarray
     angle_deg: np.ndarray
@@ -44,9 +44,9 @@ class FrameKeyAreas(NamedTuple):
 def find_key_areas(
     frames: Iterable[np.ndarray | str], tips: np.ndarray, directions_deg: np.ndarray, *, least_score: float
 ) -> FrameKeyAreas:
-    """What the front end makes of n frames of one film, or of a text that says why there is none; digests are
-    left empty. A direction that is not known (NaN) is sought in the motion of the ground, where frames follow
-    one another, IN_A_ROW of them in memory at a time."""
+    """Finds the key areas of n frames of one film. A frame may also be a text, the reason why there is no
+    picture; digests are left empty. An unknown direction (NaN) is estimated from the motion of the ground in
+    successive frames; IN_A_ROW of them are in memory at a time."""
     areas: list[key_area.KeyArea] = []
     surroundings = np.full((len(tips), len(familiar.NAMES)), np.nan, np.float32)
     walking, measured = zip(frames, tips, directions_deg, strict=True), -1
@@ -71,8 +71,8 @@ def find_key_areas(
 def _found(
     crops: Sequence[key_area.Crop | str], directions_deg: Sequence[float], least_score: float
 ) -> list[key_area.KeyArea]:
-    """Key areas of crops that follow one another: along the direction told, or the motion of the ground where
-    it can be seen, else of the only line there is."""
+    """Returns the key areas of successive crops: along the given direction, else along the motion of the
+    ground if it is visible, else along the only line there is."""
     moving = _motion(crops, directions_deg)
     areas = []
     for i, (one, told) in enumerate(zip(crops, directions_deg, strict=True)):
@@ -97,8 +97,8 @@ def _found(
 def _motion(
     crops: Sequence[key_area.Crop | str], directions_deg: Sequence[float]
 ) -> dict[int, tuple[float, str]]:
-    """{place: (direction or NaN, why not)} of the frames of which nobody told the direction, as far as they
-    follow one another."""
+    """Returns {place: (direction or NaN, why not)} for the frames without a given direction, from the frames
+    that follow one another."""
     unknown = [
         i
         for i, (one, told) in enumerate(zip(crops, directions_deg, strict=True))
@@ -114,7 +114,7 @@ def _motion(
 
 
 def _cropped(frame: np.ndarray | str, tip: np.ndarray) -> key_area.Crop | str:
-    """The crop round the tip (x, y), or the reason why there is none."""
+    """Returns the crop around the tip (x, y), or the reason why there is none."""
     reason = frame if isinstance(frame, str) else _shallow(frame)
     if reason or isinstance(frame, str) or not np.isfinite(tip).all():
         return reason or NO_TIP
@@ -125,8 +125,8 @@ def _cropped(frame: np.ndarray | str, tip: np.ndarray) -> key_area.Crop | str:
 
 
 def _shallow(frame: np.ndarray) -> str:
-    """Why a frame of 16 bits is not used of which a camera filled the
-    lower ones alone: the front end would see black."""
+    """Returns why a 16-bit frame is rejected if the camera filled only its lower bits, since the front end
+    would see black; else ""."""
     if frame.dtype != np.uint16 or frame.max() >= 1 << FILLED_BITS:
         return ""
     return (

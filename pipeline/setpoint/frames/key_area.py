@@ -1,9 +1,9 @@
-"""Nozzle frame -> 48 x 16 key area along the freshly extruded line, or the reason why there is none: the
-paper's sweep, and a form that real frames do not fool.
+"""Cuts the 48 x 16 key area along the freshly extruded line out of a nozzle frame, or gives the reason why
+there is none. This is the paper's sweep, made robust for real frames.
 
-Angles are degrees as the picture is seen, 0 right, 90 down (towards the camera), 270 up
-(the nozzle). Key areas have rows across the line and columns along it, from the tip
-outward. The paper is Li and Pattinson 2025, section 2.2.1.
+Angles are in degrees as seen in the picture: 0 right, 90 down (towards the camera), 270 up (the nozzle). Rows
+of a key area run across the line, columns along it, from the tip outward. The paper is Li and Pattinson 2025,
+section 2.2.1.
 """
 
 import functools
@@ -20,8 +20,8 @@ SMALLEST = 64
 # ridges are sought in profiles across rays: radii every STRIDE px from START on (nearer, the rim of the
 # nozzle is seen), offsets every STEP px up to REACH
 START, STRIDE, STEP, REACH = 12, 3, 2, 28
-# (half-width of the strip, distance of its flanks, both in steps; weight): the line of an ordinary bead, and
-# a broad bead, which the shading of a part mimics better
+# (half-width of the strip, distance of its flanks, both in steps; weight): an ordinary bead, and a broad
+# bead, which is more easily confused with the shading of a part
 SCALES = ((1, 5, 1.0), (3, 8, 0.6))
 # the line may pass beside the calibrated tip by this many steps
 MISS = 4
@@ -33,21 +33,21 @@ OPEN = np.arange(-30, 211, COARSE)
 # a direction from G-code is trusted to this many degrees: the line
 # bends, and the camera's turn is known to a few
 LEEWAY_DEG = 6
-# another line that leaves the tip at least APART_DEG away and is this share as strong leaves it open which is
-# the fresh one
+# if another line leaves the tip at least APART_DEG away and is at least this fraction as strong, the fresh
+# line cannot be identified
 APART_DEG, RIVAL = 24, 0.35
-# a nozzle this close to where it was calibrated is at home
+# a nozzle this close to its calibrated place counts as at home
 HOME_PX = 2
-# what scores within this share of the best belongs to the same line
+# scores within this fraction of the best belong to the same line
 NEARLY = 0.1
 
 
 class KeyArea(NamedTuple):
-    """The key area of one frame: image (16, 48) uint8, equalised; zeros where `reason` is not empty.
+    """The key area of one frame. `image` (16, 48) uint8 is equalised, and zero if `reason` is not empty.
 
-    angle_deg is the line's direction from the tip, miss_px by how much it passes beside the tip
-    (to the right of who looks along it), score its ridge in gray levels of 8 bits, padded_share
-    the share of the crop that lies outside the frame.
+    `angle_deg`: the line's direction from the tip; `miss_px`: how far the line passes beside the tip,
+    positive to the right if one looks along the line; `score`: height of its ridge in gray levels of 8 bits;
+    `padded_share`: fraction of the crop outside the frame.
     """
 
     image: np.ndarray
@@ -59,8 +59,8 @@ class KeyArea(NamedTuple):
 
 
 class KeyAreas(NamedTuple):
-    """Those of n frames: images (n, 16, 48) uint8, angle_deg, miss_px,
-    score, padded_share (n,), n reasons, valid (n,) bool."""
+    """The key areas of n frames: `images` (n, 16, 48) uint8; `angle_deg`, `miss_px`, `score`, `padded_share`
+    (n,); n `reasons`; `valid` (n,) bool."""
 
     images: np.ndarray
     angle_deg: np.ndarray
@@ -72,8 +72,8 @@ class KeyAreas(NamedTuple):
 
 
 class Crop(NamedTuple):
-    """Gray crop (350, 350) uint8 with the tip at (175, 175); levels (256,) uint8 is its equalisation,
-    padded_share the share of it that lies outside the frame."""
+    """Gray crop (350, 350) uint8 with the tip at (175, 175); `levels` (256,) uint8, its equalisation table;
+    `padded_share`, the fraction of the crop outside the frame."""
 
     gray: np.ndarray
     levels: np.ndarray
@@ -82,11 +82,11 @@ class Crop(NamedTuple):
 
 
 def crop(frame: np.ndarray, tip: tuple[float, float]) -> Crop:
-    """The square of 350 px around the tip (x, y) in gray; what lies outside the frame
-    repeats its border and is left out of the equalisation.
+    """Returns the gray square of 350 px around the tip (x, y). Outside the frame its border pixels are
+    repeated; these are left out of the equalisation.
 
-    frame is gray (h, w) or BGR(A) (h, w, 3 or 4) of uint8 or uint16 (of which the upper 8 bits are used).
-    Raises ValueError for other frames and a tip outside.
+    `frame`: gray (h, w) or BGR(A) (h, w, 3 or 4), uint8 or uint16 (its upper 8 bits are used). Raises
+    ValueError for other frames, or if the tip lies outside.
     """
     _check(frame, tip)
     h, w = frame.shape[:2]
@@ -107,7 +107,8 @@ def find(
     direction_deg: float | None = None,
     leeway_deg: int = LEEWAY_DEG,
 ) -> KeyArea:
-    """The key area of a frame with its tip (x, y): find_in its crop. Raises ValueError as crop does."""
+    """Returns the key area of a frame with its tip at (x, y): `find_in` of its crop. Raises ValueError as
+    `crop`."""
     return find_in(
         crop(frame, tip), least_score=least_score, direction_deg=direction_deg, leeway_deg=leeway_deg
     )
@@ -116,12 +117,14 @@ def find(
 def find_in(
     c: Crop, *, least_score: float, direction_deg: float | None = None, leeway_deg: int = LEEWAY_DEG
 ) -> KeyArea:
-    """The key area along a ridge: score = strip - brighter flank; rejected below least_score gray levels.
+    """Returns the key area along a ridge, with score = strip - brighter flank. It is rejected if the score is
+    below `least_score` gray levels.
 
-    With direction_deg, known from G-code or from the ground's motion, only rays within leeway_deg of it are
-    looked at, those on the nozzle too, and only lines that pass the tip within MISS steps: neighbours further
-    off are not seen. Without it the strongest ridge that the nozzle does not hide is taken, and where
-    another line is nearly as strong, none: nothing in one picture tells which was laid last.
+    `direction_deg` is known from G-code or from the motion of the ground. If it is given, only rays within
+    `leeway_deg` of it are searched, also those over the nozzle. Only lines that pass the tip within MISS
+    steps count, so lines further away are ignored. If it is not given, the strongest ridge not hidden by the
+    nozzle is taken. If another line is nearly as strong, the frame is rejected, because one picture cannot
+    tell which line was laid last.
     """
     ridge = _ridge(c.gray, direction_deg, leeway_deg)
     angle, miss, score = ridge.angle_deg, ridge.miss_px, ridge.score
@@ -150,8 +153,8 @@ def find_all(
     least_score: float,
     directions_deg: np.ndarray | float | None = None,
 ) -> KeyAreas:
-    """Key areas of n frames, each with its tip (n, 2) or one for all (2,), and its direction (n,), or one for
-    all, where known: NaN is not known."""
+    """Returns the key areas of n frames. `tips`: (n, 2), or (2,) for all; `directions_deg`: (n,), or one for
+    all; NaN if unknown."""
     frames = list(frames)
     tips = np.broadcast_to(np.asarray(tips, float), (len(frames), 2))
     directions = np.broadcast_to(np.nan if directions_deg is None else directions_deg, len(frames))
@@ -174,8 +177,8 @@ def find_all(
 
 
 class NozzleDrift(NamedTuple):
-    """Where the nozzle is seen: offset (x, y) in px from the calibrated tip, how alike it looks there, a
-    correlation of -1..1, and by how much more than at home."""
+    """Where the nozzle is seen: `offset_px` (x, y) from the calibrated tip; `correlation` with the template
+    there, -1..1; `advantage`, by how much that correlation exceeds the one at the calibrated place."""
 
     offset_px: tuple[int, int]
     correlation: float
@@ -183,11 +186,11 @@ class NozzleDrift(NamedTuple):
 
 
 def nozzle_template(frame: np.ndarray, tip: tuple[float, float], *, size_px: int) -> np.ndarray:
-    """Gray patch (7/8 size, size) uint8 of the nozzle above the calibrated tip, cut from the frame on which
-    it was calibrated: a square with the tip in the middle of its lower edge, less its lowest eighth, where
-    beads are laid and look different on each segment.
+    """Returns the gray patch (7/8 size, size) uint8 of the nozzle above the calibrated tip, cut from the
+    frame on which it was calibrated. It is a square with the tip in the middle of its lower edge, without its
+    lowest eighth: beads are laid there and look different on each segment.
 
-    Raises ValueError where the patch does not lie inside the frame.
+    Raises ValueError if the patch does not lie inside the frame.
     """
     _check(frame, tip)
     left, top = _corner(tip, size_px)
@@ -203,9 +206,12 @@ def nozzle_template(frame: np.ndarray, tip: tuple[float, float], *, size_px: int
 def drift(
     frames: Sequence[np.ndarray], template: np.ndarray, tip: tuple[float, float], *, reach_px: int
 ) -> NozzleDrift:
-    """Where within reach_px of the calibrated tip the nozzle is, by the mean over the frames
-    of the normalised cross-correlation: an alarm that the camera moved, never a new
-    calibration. At home is within HOME_PX of the calibrated tip.
+    """Finds the nozzle within `reach_px` of the calibrated tip by the normalised cross-correlation, averaged
+    over the frames. This is an alarm that the camera moved, never a new calibration. The nozzle counts as at
+    home within HOME_PX of the calibrated tip.
+
+    Raises ValueError without frames, for frames that `crop` refuses, or if the template does not fit into the
+    frame.
     """
     if not len(frames):
         raise ValueError("nozzle drift: expected frames to look at, found none; give at least one")
@@ -243,8 +249,8 @@ def drift(
 
 
 def drawn(frame: np.ndarray, tip: tuple[float, float], area: KeyArea) -> np.ndarray:
-    """The crop as (350, 350, 3) uint8 RGB with the tip and the rectangle, green where the key area was
-    accepted, red with the reason where not, for a report."""
+    """Draws the crop for a report, (350, 350, 3) uint8 RGB, with the tip and the rectangle: green if the key
+    area was accepted, red with the reason if not."""
     picture = cv2.cvtColor(crop(frame, tip).gray, cv2.COLOR_GRAY2RGB)
     colour = (220, 40, 40) if area.reason else (40, 200, 80)
     at = np.rint(corners(area.angle_deg, area.miss_px) + SIDE // 2).astype(np.int32)
@@ -265,13 +271,13 @@ def drawn(frame: np.ndarray, tip: tuple[float, float], area: KeyArea) -> np.ndar
 
 
 def _corner(tip: tuple[float, float], size: int) -> tuple[int, int]:
-    """Left and top of the template whose lower edge has the tip in its middle."""
+    """Returns left and top of the template, if the tip is in the middle of its lower edge."""
     return round(float(tip[0])) - size // 2, round(float(tip[1])) - size + 1
 
 
 class _Ridge(NamedTuple):
-    """A ridge, and the strongest one that leaves the tip elsewhere, with a score of 0 where the direction is
-    known."""
+    """A ridge, and the strongest other one that leaves the tip in another direction; its score is 0 if the
+    direction is known."""
 
     angle_deg: float
     miss_px: float
@@ -281,8 +287,8 @@ class _Ridge(NamedTuple):
 
 
 def _ridge(gray: np.ndarray, direction_deg: float | None, leeway_deg: int) -> _Ridge:
-    """The ridge of the fresh line; without a direction every COARSE degrees, then every degree around the
-    best of them."""
+    """Returns the ridge of the fresh line. Without a known direction, searches every COARSE degrees, then
+    every degree around the best."""
     small = cv2.resize(gray, None, fx=1 / STEP, fy=1 / STEP, interpolation=cv2.INTER_AREA).ravel()
     rival = ()
     if direction_deg is None:
@@ -296,8 +302,8 @@ def _ridge(gray: np.ndarray, direction_deg: float | None, leeway_deg: int) -> _R
         angles = round(direction_deg) + np.arange(-leeway_deg, leeway_deg + 1)
     score = _scores(small, _profiles()[:, angles % 360])
     best, at = float(score.max()), int(score.argmax()) % score.shape[1]
-    # what is nearly as strong has a say, so that a broad line is taken
-    # in its middle; never another line beside it
+    # average over scores that are nearly as strong, so that a broad line
+    # is taken in its middle; never over another line beside it
     beside = slice(max(at - 2, 0), at + 3)
     weight = np.maximum(score[:, beside] - (best - NEARLY * abs(best) - 1e-6), 0)
     weight /= weight.sum()
@@ -306,9 +312,9 @@ def _ridge(gray: np.ndarray, direction_deg: float | None, leeway_deg: int) -> _R
 
 
 def _scores(small: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """(rays, misses) ridges of profiles at `places` (radii, rays, offsets): strip less its
-    brighter flank, in the near or the far half of the ray, whichever is less, as a line
-    stands out all along; the most over the scales."""
+    """Returns the ridge heights (rays, misses) of profiles at `places` (radii, rays, offsets): strip minus
+    its brighter flank. The weaker of the near and the far half of the ray counts, because a line stands out
+    along its whole length; then the largest over the scales."""
     radii, rays, offsets = places.shape
     samples = small.take(places.reshape(radii, -1), mode="clip")
     half = radii // 2
@@ -322,8 +328,8 @@ def _scores(small: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def _ridge_filters(offsets: int) -> np.ndarray:
-    """(offsets, scales x 2 x misses): strip less left flank, and strip less right
-    flank, for every miss, times the scale's weight."""
+    """Returns (offsets, scales x 2 x misses): strip minus left flank, and strip minus right flank, for every
+    miss, times the scale's weight."""
     place = np.arange(offsets) - offsets // 2
     columns = []
     for half, away, weight in SCALES:
@@ -336,8 +342,8 @@ def _ridge_filters(offsets: int) -> np.ndarray:
 
 @functools.cache
 def _profiles() -> np.ndarray:
-    """The gather table of the ridges: (radii, 360, offsets), places in the crop reduced by STEP, at every
-    radius along and offset across each ray."""
+    """Returns the look-up table of the ridges (radii, 360, offsets): pixel indices in the crop reduced by
+    STEP, at every radius along and every offset across each ray."""
     angle = np.deg2rad(np.arange(360))[:, None]
     along, across = np.arange(START, LENGTH, STRIDE)[:, None, None], np.arange(-REACH, REACH + 1, STEP)
     x, y = along * np.cos(angle) - across * np.sin(angle), along * np.sin(angle) + across * np.cos(angle)
@@ -347,13 +353,18 @@ def _profiles() -> np.ndarray:
 
 @functools.cache
 def _open_profiles() -> np.ndarray:
-    """Those of OPEN at every second radius: enough for a first direction."""
+    """Returns the rows of OPEN at every second radius, which is enough for a first direction."""
     return np.ascontiguousarray(_profiles()[::2, OPEN % 360])
 
 
 def _rectangle(c: Crop, angle_deg: float, miss_px: float) -> np.ndarray:
-    """(16, 48) equalised levels of the rectangle s, e -+ g h with g = (s_y -
-    e_y, e_x - s_x) / |.| (1)-(3), 87 x 20 px resized."""
+    """Returns the equalised levels (16, 48) of the rectangle (1)-(3) with 87 x 20 px, resized. Its vertices
+    are
+
+        s -+ g h    and    e -+ g h,    g = (s_y - e_y, e_x - s_x) / |.|
+
+    with the line's start s and end e, and half the rectangle's height h.
+    """
     rows, columns = SHAPE
     fine = 2 * columns  # 0.9 px along: one sample a column would skip pixels
     a = np.deg2rad(angle_deg)
@@ -374,7 +385,8 @@ def _rectangle(c: Crop, angle_deg: float, miss_px: float) -> np.ndarray:
 
 
 def corners(angle_deg: float, miss_px: float) -> np.ndarray:
-    """(4, 2) vertices v1 v2 v4 v3 of the rectangle (2)-(3) about the tip, in px, in drawing order."""
+    """Returns the vertices v1 v2 v4 v3 (4, 2) of the rectangle (2)-(3), in px relative to the tip, in drawing
+    order."""
     a = np.deg2rad(angle_deg)
     ray, g = np.array([np.cos(a), np.sin(a)]), np.array([-np.sin(a), np.cos(a)])
     low, high = (miss_px - HEIGHT / 2) * g, (miss_px + HEIGHT / 2) * g
@@ -382,7 +394,7 @@ def corners(angle_deg: float, miss_px: float) -> np.ndarray:
 
 
 def _equalisation(gray: np.ndarray) -> np.ndarray:
-    """(256,) uint8: the table of cv2.equalizeHist for this picture."""
+    """Returns the table of cv2.equalizeHist for this picture, (256,) uint8."""
     counts = cv2.calcHist([gray], [0], None, [256], [0, 256]).ravel()
     first = int((counts > 0).argmax())
     if counts[first] == gray.size:
@@ -423,7 +435,7 @@ def _check(frame: np.ndarray, tip: tuple[float, float]) -> None:
 
 
 def _outside(c: Crop, angle_deg: float, miss_px: float) -> float:
-    """Share of the rectangle that lies outside the frame, on a grid of 40 x 40 points."""
+    """Returns the fraction of the rectangle outside the frame, on a grid of 40 x 40 points."""
     if not c.padded_share:
         return 0.0
     left, top, right, bottom = c.inside

@@ -1,11 +1,12 @@
-"""Synthetic nozzle frames with labels: flow -> width of the fresh bead -> what an endoscope beside the nozzle
-sees, under conditions that stay for a whole segment.
+"""Synthetic nozzle frames with labels: from the flow to the width of the fresh bead to the picture of an
+endoscope beside the nozzle. Conditions are constant within a segment.
 
-The numbers below are the difficulty of the scenes. They are set so that the profile support vector machine
-(yardsticks.py) names 0.73-0.76 of single images on held-out segments; a test holds them there. They were set
-anew after networks had been seen: less that stays through a segment but the width itself, more that changes
-from image to image, as what stays moves a classifier's borders for a whole segment, which no window averages
-out. Change a number, and every figure of the classifier and of the closed loop is another.
+The numbers below set the difficulty of the scenes. With them the profile support vector machine
+(yardsticks.py) is right on 0.73-0.76 of single images of held-out segments, and a test checks this. They were
+changed once after networks had been tested: apart from the width, less now varies from segment to segment,
+and more from image to image. Errors that last a whole segment shift a classifier's borders, and no window
+averages them out. If one of these numbers changes, every figure of the classifier and of the closed loop
+changes.
 """
 
 import functools
@@ -20,7 +21,7 @@ from pipeline.setpoint.frames.key_area import SIDE, KeyAreas, find_all
 # classes 0 below 90, 1 from 90 to 110, 2 above 110 percent of the nominal flow (paper,
 # section 2.2); the flows that a printer is set to
 BORDERS, FLOWS = (90.0, 110.0), (20.0, 310.0)
-# where flows to judge are uniform, in percent; deviation of log flow of the bump in those to learn from
+# range in which test flows are uniform, in percent; deviation of log flow of the bump in training flows
 JUDGED, BUMP = (70.0, 150.0), 0.25
 TEMPERATURES = (190.0, 200.0, 210.0, 220.0, 230.0)
 # a bead of nominal flow in px; a stadium of height h has the section (w - h) h + pi h^2 / 4, so that w =
@@ -48,12 +49,13 @@ TRAVEL, REACH_PX = 60, 22.0
 
 
 class PrintedSegment(NamedTuple):
-    """Conditions of one printed segment. direction_deg is the way the line leaves the tip
-    (0 right, 90 down), tip the calibrated tip (x, y).
+    """Conditions of one printed segment. `direction_deg`: direction in which the line leaves the tip (0
+    right, 90 down); `tip`: the calibrated tip (x, y).
 
-    ground (350, 350) uint8 is the lit plate with older beads, texture int16 what moves over it, nozzle and
-    its mask (350, 350) uint8. at (k,) are the pixels near the line in the flattened frame, along and across
-    (k,) their places in px; the others are gray levels and px.
+    `ground` (350, 350) uint8: the lit plate with older beads; `texture` int16: moves over the ground;
+    `nozzle` and its `mask` (350, 350) uint8. `at` (k,): pixels near the line in the flattened frame; `along`
+    and `across` (k,): their places in px. `contrast`, `specular` and `noise` are in gray levels, `blur_px` in
+    px.
     """
 
     direction_deg: float
@@ -73,8 +75,9 @@ class PrintedSegment(NamedTuple):
 
 
 class RenderedFrames(NamedTuple):
-    """frames (n, 350, 350) uint8 and their truth: flow (n,) in percent, temperature (n,) in degC, width_px
-    (n,) of the bead as drawn, line (n,) whether there is one; direction_deg and tip of their segment."""
+    """`frames` (n, 350, 350) uint8 and their truth: `flow` (n,) in percent; `temperature` (n,) in degC;
+    `width_px` (n,), width of the drawn bead; `line` (n,), whether there is a line; `direction_deg` and `tip`
+    of the segment."""
 
     frames: np.ndarray
     flow: np.ndarray
@@ -86,14 +89,14 @@ class RenderedFrames(NamedTuple):
 
 
 def label(flow: np.ndarray) -> np.ndarray:
-    """Class of a flow in percent: 0 below 90, 1 from 90 to 110, 2 above; a flow that is not known (NaN) has
-    none, and is for the caller to leave out."""
+    """Returns the class of a flow in percent: 0 below 90, 1 from 90 to 110, 2 above. The class of an unknown
+    flow (NaN) has no meaning; the caller leaves it out."""
     flow = np.asarray(flow)
     return (flow >= BORDERS[0]).astype(np.int64) + (flow > BORDERS[1])
 
 
 def draw_segment(rng: np.random.Generator) -> PrintedSegment:
-    """The conditions of a new segment."""
+    """Draws the conditions of a new segment at random."""
     direction, miss = rng.uniform(*DIRECTION_DEG), TIP_PX * rng.standard_normal(2)
     middle = SIDE // 2
     x, y = _grid()
@@ -123,8 +126,8 @@ def draw_segment(rng: np.random.Generator) -> PrintedSegment:
 def render(
     segment: PrintedSegment, flow: np.ndarray, temperature: np.ndarray, rng: np.random.Generator
 ) -> RenderedFrames:
-    """n frames of one segment, each with its own flow (n,) in percent and temperature (n,) in degC (scalars
-    for all frames alike: give at least one array)."""
+    """Renders n frames of one segment, each with its own flow (n,) in percent and temperature (n,) in degC.
+    One of them may be a scalar for all frames."""
     flow, temperature = np.broadcast_arrays(
         np.atleast_1d(np.asarray(flow, float)), np.asarray(temperature, float)
     )
@@ -161,16 +164,16 @@ def render(
 
 
 def key_areas(frames: RenderedFrames, *, least_score: float) -> KeyAreas:
-    """The key areas of one segment's frames, its direction known from G-code."""
+    """Returns the key areas of one segment's frames; the direction is known from G-code."""
     return find_all(frames.frames, frames.tip, least_score=least_score, directions_deg=frames.direction_deg)
 
 
 def draw_flow(rng: np.random.Generator, n: int) -> np.ndarray:
-    """(n,) flows in percent to learn and to calibrate with, in random order: of every two one log-uniform
-    over FLOWS, and one from a log-normal bump of deviation BUMP round 100 %, where the classes' borders are.
+    """Draws flows (n,) in percent for training and calibration, in random order. One half is log-uniform over
+    FLOWS; the other is log-normal around 100 % with deviation BUMP, where the classes' borders are.
 
-    The density is continuous everywhere, also across the borders: a flow of 111 % is as frequent as one of
-    109 %. Both halves are drawn in equal strata, so that few flows already hold all classes.
+    The density is continuous everywhere, also across the borders, so a flow of 111 % is as frequent as one of
+    109 %. Both halves are drawn in equal strata, so that even a few flows contain all classes.
     """
     wide, near = _strata(rng, n - n // 2), _strata(rng, n // 2)
     low, high = np.log(FLOWS)
@@ -180,33 +183,33 @@ def draw_flow(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def draw_judged_flow(rng: np.random.Generator, n: int) -> np.ndarray:
-    """(n,) flows in percent to judge on, in random order: of every two one uniform over JUDGED, where a
-    controller works, and one log-uniform over FLOWS, both in equal strata."""
+    """Draws flows (n,) in percent for tests, in random order. One half is uniform over JUDGED, where a
+    controller works, the other log-uniform over FLOWS; both are drawn in equal strata."""
     low, high = np.log(FLOWS)
     near = JUDGED[0] + (JUDGED[1] - JUDGED[0]) * _strata(rng, n - n // 2)
     return rng.permutation(np.concatenate([near, np.exp(low + (high - low) * _strata(rng, n // 2))]))
 
 
 def _strata(rng: np.random.Generator, n: int) -> np.ndarray:
-    """(n,) numbers, one uniform in each of n equal parts of 0..1."""
+    """Returns one uniform number in each of n equal parts of 0..1 (n,)."""
     return (np.arange(n) + rng.random(n)) / max(n, 1)
 
 
 def draw_class_flow(rng: np.random.Generator, kind: int, n: int) -> np.ndarray:
-    """n flows of a class in percent, uniform between its borders within FLOWS: as the paper's data are
-    dealt out, with a leap at each border."""
+    """Draws n flows of a class in percent, uniform between its borders within FLOWS. The paper's data are
+    distributed in this way, with a step of the density at each border."""
     ends = (FLOWS[0], *BORDERS, FLOWS[1])
     return rng.uniform(ends[kind], ends[kind + 1], n)
 
 
 def _slope(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Light from one side: a plane of GRADIENT levels over the frame."""
+    """Returns light from one side: a plane that rises by up to GRADIENT gray levels over the frame."""
     way, rise = rng.uniform(0, 2 * np.pi), rng.uniform(*GRADIENT) / SIDE
     return np.float32(rise * np.cos(way)) * x + np.float32(rise * np.sin(way)) * y
 
 
 def _older(rng: np.random.Generator, across: np.ndarray) -> np.ndarray:
-    """(350, 350) in 0..1: beads beside the fresh one, laid before it, on one side."""
+    """Returns, in 0..1 (350, 350), older beads on one side of the fresh one."""
     side, pitch = rng.choice([-1.0, 1.0]), rng.uniform(*OLDER_PITCH)
     place = np.float32(side) * across / np.float32(pitch)
     rho = 2 * (place - np.maximum(np.rint(place), 1)) * np.float32(pitch / WIDTH_PX)
@@ -214,8 +217,8 @@ def _older(rng: np.random.Generator, across: np.ndarray) -> np.ndarray:
 
 
 def _nozzle(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A cone above the tip with a flat end, dark steel to bright
-    brass, lit from one side; and where it is."""
+    """Draws a cone above the tip with a flat end, dark steel to bright brass, lit from one side. Returns the
+    picture and its mask."""
     slope, flat = np.float32(np.tan(np.deg2rad(rng.uniform(*HALF_CONE_DEG)))), np.float32(rng.uniform(6, 12))
     inside = (y < 0) & (np.abs(x) < flat - slope * y)
     level, side, band = rng.uniform(25, 75), rng.uniform(-0.4, 0.4), rng.uniform(-60, 60)
@@ -225,7 +228,8 @@ def _nozzle(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> tuple[np.
 
 
 def _texture(rng: np.random.Generator) -> np.ndarray:
-    """int16 canvas of plate texture, wider than the frame by TRAVEL on every side; drawn at half its size."""
+    """Returns plate texture as int16, larger than the frame by TRAVEL px on every side; it is drawn at half
+    size and enlarged."""
     side = SIDE // 2 + TRAVEL
     t = cv2.GaussianBlur(
         rng.standard_normal((side, side), dtype=np.float32), (0, 0), rng.uniform(*GRAIN_PX) / 2
@@ -236,13 +240,13 @@ def _texture(rng: np.random.Generator) -> np.ndarray:
 
 @functools.cache
 def _grid() -> tuple[np.ndarray, np.ndarray]:
-    """x (1, 350) and y (350, 1) from the tip in px."""
+    """Returns x (1, 350) and y (350, 1) relative to the tip in px."""
     place = np.arange(SIDE, dtype=np.float32) - SIDE // 2
     return place[None, :], place[:, None]
 
 
 def _moved(segment: PrintedSegment, rng: np.random.Generator) -> np.ndarray:
-    """The ground with its texture at a new place along the line."""
+    """Returns the ground with its texture at a new random place along the line."""
     travel, a = rng.uniform(-TRAVEL, TRAVEL), np.deg2rad(segment.direction_deg)
     x, y = round(TRAVEL + travel * np.cos(a)), round(TRAVEL + travel * np.sin(a))
     return cv2.add(segment.ground, segment.texture[y : y + SIDE, x : x + SIDE], dtype=cv2.CV_8U)
@@ -258,8 +262,9 @@ def _lay(
     place: np.ndarray,
     level: float,
 ) -> None:
-    """Draws the fresh bead: level falls as 1 - shading rho^2 with rho = 2 t / w across
-    it, a specular line at specular_at, rough edges. place: segment.along in whole px; level of the ground."""
+    """Draws the fresh bead. Across it the level falls as 1 - shading rho^2 with rho = 2 t / w; it has a
+    specular line at specular_at and rough edges. `place`: segment.along in whole px; `level`: mean gray level
+    of the ground."""
     turn, beside, light = (
         np.tan(np.deg2rad(TURN_DEG)) * rng.standard_normal(),
         PLACE_PX * rng.standard_normal(),

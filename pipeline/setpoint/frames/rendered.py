@@ -1,4 +1,4 @@
-"""Rendered nozzle frames with their labels. Workers run it, so it knows no learner."""
+"""Rendered nozzle frames with their labels. Worker processes import this module, so it imports no learner."""
 
 import itertools
 from collections.abc import Sequence
@@ -8,22 +8,22 @@ import numpy as np
 
 from pipeline.setpoint.frames import familiar, nozzle_scene
 
-# bins of the true flow in percent: fine where controllers must find
-# 100 %, wide where any window says the same
+# bins of the true flow in percent: fine around 100 %, which controllers
+# must find, wide at flows where all windows look alike
 FLOW_EDGES = np.concatenate(
     [[20.0, 35, 50, 60, 70], np.arange(75, 125, 2.5), np.arange(125, 150, 5.0), np.arange(150, 311, 40.0)]
 )
-# in which a controller stays, and would see one window's chance again and again
+# range in which a controller stays; with few windows it would see the same random window again and again
 FINE = (75.0, 125.0)
-# a line that stands out less than its darker flank is none, whatever the least score; of windows by which a
-# camera is known, the score in gray levels below which a frame is not measured
+# a line with a score below LEAST_SCORE is none, whatever the user's least score; to learn a camera, frames
+# with a score below CAMERA_SCORE gray levels are not measured
 LEAST_SCORE, CAMERA_SCORE = 0.0, 10.0
 
 
 class LabelledFrames(NamedTuple):
-    """n frames: key areas (n, 16, 48) uint8, class and true flow in percent (n,), temperature (n,) in °C,
-    print and segment (n,), valid (n,) and the reason why not; score (n,) in gray levels of the line's
-    ridge; surroundings (n, measures) of familiar.NAMES, NaN of frames that are not measured."""
+    """n frames: key areas (n, 16, 48) uint8; class and true flow in percent (n,); temperature (n,) in °C;
+    print and segment (n,); `valid` (n,), and the reason if not; `score` (n,), the line's ridge in gray
+    levels; `surroundings` (n, measures) of familiar.NAMES, NaN for frames that were not measured."""
 
     images: np.ndarray
     label: np.ndarray
@@ -40,14 +40,15 @@ class LabelledFrames(NamedTuple):
         return LabelledFrames(*(a[rows] for a in self))
 
     def labelled(self) -> tuple[np.ndarray, ...]:
-        """Of the valid ones what a learner needs: images, temperature, class, flow, segment."""
+        """Returns images, temperature, class, flow and segment of the valid frames, as a learner needs
+        them."""
         some = self.take(self.valid)
         return some.images, some.temperature, some.label, some.flow, some.segment
 
 
 def filmed(seed: Sequence[int], flow: np.ndarray, frames: int, *, measured: bool) -> LabelledFrames:
-    """A segment at each flow (n,) in percent, with the temperatures in turn; `measured`: with the measures of
-    its surroundings."""
+    """Renders a segment at each flow (n,) in percent, with the temperatures in turn. `measured`: also
+    measures the surroundings."""
     rng = np.random.default_rng(seed)
     pieces = []
     for percent, degrees in zip(flow, np.resize(nozzle_scene.TEMPERATURES, len(flow)), strict=True):
@@ -57,10 +58,10 @@ def filmed(seed: Sequence[int], flow: np.ndarray, frames: int, *, measured: bool
 
 
 def swept(seed: Sequence[int], windows: float, frames: int) -> LabelledFrames:
-    """One segment's conditions, all at one temperature, over all bins of the
-    flow: windows of `frames` frames with a flow each.
+    """Renders one segment at one temperature over all bins of the flow, in windows of `frames` frames, each
+    with its own flow.
 
-    windows: how many in each bin within FINE on average; elsewhere no more than one.
+    `windows`: mean number in each bin within FINE; in other bins at most one.
     """
     rng = np.random.default_rng(seed)
     segment, degrees = nozzle_scene.draw_segment(rng), rng.choice(nozzle_scene.TEMPERATURES)
@@ -73,7 +74,7 @@ def swept(seed: Sequence[int], windows: float, frames: int) -> LabelledFrames:
 
 
 def _labelled(scene: nozzle_scene.RenderedFrames, *, measured: bool) -> LabelledFrames:
-    """The frames of one segment."""
+    """Returns the labelled frames of one segment."""
     areas = nozzle_scene.key_areas(scene, least_score=LEAST_SCORE)
     number, reasons = np.zeros(len(scene.flow), int), np.array(areas.reasons, object)
     truth = nozzle_scene.label(scene.flow), scene.flow, scene.temperature, number, number
@@ -83,7 +84,7 @@ def _labelled(scene: nozzle_scene.RenderedFrames, *, measured: bool) -> Labelled
 
 
 def joined(several: Sequence[LabelledFrames]) -> LabelledFrames:
-    """One behind the other, their prints and segments numbered on."""
+    """Concatenates these frames and numbers their prints and segments consecutively."""
     shift, pieces = 0, []
     for one in several:
         pieces.append(one._replace(print_number=one.print_number + shift, segment=one.segment + shift))
@@ -92,7 +93,7 @@ def joined(several: Sequence[LabelledFrames]) -> LabelledFrames:
 
 
 def standing_out(frames: LabelledFrames, least_score: float) -> LabelledFrames:
-    """The frames, those not valid whose line stands out by less than least_score gray levels."""
+    """Returns the frames; those with a line below `least_score` gray levels are marked not valid."""
     faint = frames.valid & ~(frames.score >= least_score)
     reasons = frames.reasons.copy()
     reasons[faint] = f"no fresh line: it stands out by less than {least_score:g} gray levels"
@@ -101,8 +102,8 @@ def standing_out(frames: LabelledFrames, least_score: float) -> LabelledFrames:
 
 
 def camera_window(seed: Sequence[int]) -> np.ndarray:
-    """(measures,) of a few frames of one new segment at one flow, over the whole range: how the camera that
-    renders looks."""
+    """Returns the measures (measures,) of a few frames of one new segment at one flow, drawn from the whole
+    range. They show how the rendering camera looks."""
     rng = np.random.default_rng(seed)
     flow = np.full(familiar.FRAMES + 1, np.exp(rng.uniform(*np.log(nozzle_scene.FLOWS))))
     segment, degrees = nozzle_scene.draw_segment(rng), rng.choice(nozzle_scene.TEMPERATURES)
@@ -112,8 +113,7 @@ def camera_window(seed: Sequence[int]) -> np.ndarray:
 
 
 def flow_edges(flows: Sequence[np.ndarray]) -> np.ndarray:
-    """FLOW_EDGES, of which those are left out that would leave a bin
-    without a window in any of several sets of flows (w,)."""
+    """Returns FLOW_EDGES without those that would leave a bin empty in any of several sets of flows (w,)."""
     bounds = [min(FLOW_EDGES[0], *(float(flow.min()) for flow in flows))]
     for edge in FLOW_EDGES[1:-1]:
         if all(((flow >= bounds[-1]) & (flow < edge)).any() for flow in flows):

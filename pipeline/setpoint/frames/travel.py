@@ -1,9 +1,10 @@
-"""The way the ground moves under a camera that rides with the nozzle: the fresh line lies along it.
+"""Finds how the ground moves under a camera that moves with the nozzle; the fresh line lies along this
+direction.
 
-What is laid stays with the plate, so that from one frame to the next plate, older beads and the end of the
+Deposited material stays on the plate. So from one frame to the next, plate, older beads and the end of the
 fresh line move away from the tip together. The shift of the ground below the tip is found by phase
-correlation (Kuglin and Hines 1975), summed over a short run of frames. Where the picture turns, where the
-motion is blurred into streaks that lie otherwise, or where no shift stands out, the direction is not known.
+correlation (Kuglin and Hines 1975), summed over a short run of frames. The direction is unknown if the
+picture turns, if motion blur shows streaks in another direction, or if no shift stands out.
 """
 
 import itertools
@@ -18,13 +19,14 @@ from pipeline.setpoint.frames.key_area import SIDE
 # ground below the tip, reduced by STEP; rows nearer than BELOW px show the nozzle's rim
 STEP, BELOW = 2, 8
 SHAPE = ((SIDE // 2 - BELOW) // STEP, SIDE // STEP)
-# a run is a frame with so many on either side, at an end of the film the first or last of as many; fewer
-# pairs than LEAST say nothing
+# a run is a frame with RUN frames on either side (at an end of the film, the first or last 2 RUN + 1); fewer
+# pairs than LEAST are not enough
 RUN, LEAST = 3, 5
-# a shift stands out by so many deviations of the correlation, by such a factor over any other, and is so long
+# a shift must stand out by this many deviations of the correlation, by this factor over any other, and be
+# this long
 DEVIATIONS, FACTOR, SHORTEST_PX = 8.0, 1.3, 3.0
-# and it is, within STEP px, the likeliest of this share of the run's pairs: frames of no film, or of a stage
-# that goes to and fro, have a shift each
+# and, within STEP px, it must be the likeliest shift in this fraction of the run's pairs; if the frames are
+# not from a film, or the stage moves to and fro, each pair has another shift
 AGREE = 0.8
 # streaks of at least this coherence give the motion's axis; it turns by at most TURN_DEG in a run, and the
 # shift lies within ALONG_DEG of it
@@ -34,8 +36,8 @@ LEEWAY_DEG = 20
 
 
 class Travel(NamedTuple):
-    """Of n frames: direction_deg (n,) in which the fresh line leaves the tip, NaN where not known; shift_px
-    (n,) from one frame to the next; reasons (n), empty where known."""
+    """For n frames: `direction_deg` (n,), in which the fresh line leaves the tip, NaN if unknown; `shift_px`
+    (n,), from one frame to the next; `reasons` (n), empty if the direction is known."""
 
     direction_deg: np.ndarray
     shift_px: np.ndarray
@@ -43,8 +45,8 @@ class Travel(NamedTuple):
 
 
 def travel(crops: Sequence[np.ndarray]) -> Travel:
-    """The travel of consecutive frames of one film, each a crop (350, 350) uint8 with the tip in its middle
-    (key_area.crop); 0 degrees right, 90 down."""
+    """Returns the travel of successive frames of one film. Each is a crop (350, 350) uint8 with the tip in
+    its middle (key_area.crop); 0 degrees is right, 90 down."""
     n = len(crops)
     if n < LEAST + 1:
         why = f"motion: {n} frames in a row are too few to see the ground move"
@@ -58,7 +60,7 @@ def travel(crops: Sequence[np.ndarray]) -> Travel:
 
 
 def _ground(crop: np.ndarray) -> np.ndarray:
-    """(84, 175) float32."""
+    """Returns the ground below the tip at half size (83, 175) float32."""
     below = crop[SIDE // 2 + BELOW : SIDE // 2 + BELOW + STEP * SHAPE[0], : STEP * SHAPE[1]]
     return cv2.resize(below, SHAPE[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
 
@@ -67,8 +69,8 @@ _WINDOW = np.outer(np.hanning(SHAPE[0]), np.hanning(SHAPE[1])).astype(np.float32
 
 
 def _streaks(ground: np.ndarray) -> tuple[float, float]:
-    """(axis in 0 .. 180 degrees, coherence 0 .. 1) of the structure tensor; a few strong edges, as of one
-    bead, weigh no more than many weak ones."""
+    """Returns (axis in 0 .. 180 degrees, coherence 0 .. 1) of the structure tensor. A few strong edges, such
+    as those of one bead, weigh no more than many weak ones."""
     smooth = cv2.GaussianBlur(ground, (0, 0), 1.0)
     x, y = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
     steepness = np.hypot(x, y)
@@ -79,8 +81,8 @@ def _streaks(ground: np.ndarray) -> tuple[float, float]:
 
 
 def _correlations(ground: np.ndarray) -> np.ndarray:
-    """(n - 1, h, w) phase correlations of neighbours, no shift in the middle; what stands still is subtracted
-    first."""
+    """Returns the phase correlations (n - 1, h, w) of neighbouring frames, with zero shift in the middle. The
+    mean of the frames around is subtracted first, which removes what stands still."""
     n = len(ground)
     spectra = [
         np.fft.rfft2((ground[k] - ground[max(0, k - RUN) : k + RUN + 1].mean(axis=0)) * _WINDOW)
@@ -98,7 +100,7 @@ def _correlations(ground: np.ndarray) -> np.ndarray:
 def _of_run(
     k: int, axis: np.ndarray, coherence: np.ndarray, surfaces: np.ndarray
 ) -> tuple[float, float, str]:
-    """(direction, shift in px, reason) of the run round frame k."""
+    """Returns (direction, shift in px, reason) of the run around frame k."""
     start = min(max(0, k - RUN), max(0, len(axis) - 2 * RUN - 1))
     run, pairs = slice(start, start + 2 * RUN + 1), surfaces[start : start + 2 * RUN]
     turned = np.abs((axis[run] - axis[k] + 90) % 180 - 90).max()

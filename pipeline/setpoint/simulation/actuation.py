@@ -1,8 +1,9 @@
-"""What is sent to the machine: when to hold and why, how far setpoints may move, and how long to wait.
+"""What is sent to the machine: when nothing may be sent and why, how far setpoints may move, and how long to
+wait.
 
-The loop through pixels (`pixels`) and the simulators (`simulator`) call the same functions: what is judged is
-what would run. In the simulators no window is held. Limits and holds take numpy arrays or jax's, with any
-leading axes.
+The loop through pixels (`pixels`) and the simulators (`simulator`) call the same functions, so what is tested
+is what would run. In the simulators every window may be acted on. Functions for limits and holds take numpy
+or jax arrays, with any leading axes.
 """
 
 from typing import Any, NamedTuple
@@ -20,24 +21,24 @@ REASONS = (
     "the picture stands still",
 )
 ACTS, FEW, FOREIGN, TIP, UNPROVEN, STILL = range(6)
-REMEMBERED = 64  # actions that the travel of 60 s is summed over: a window takes about a second
+REMEMBERED = 64  # actions remembered for the travel of 60 s: a window takes about a second
 
 
 # ---- when to hold
 
 
 def still(flow_seen, last_seen):
-    """STILL where a window shows to the last bit the flow that the one before did, as no camera that looks
-    does; else ACTS. NaN, of a camera that shows classes only, is never still."""
+    """Returns STILL if a window shows exactly the flow of the one before, to the last bit, which no working
+    camera does; else ACTS. NaN, from a camera that shows classes only, is never still."""
     return STILL * (flow_seen == last_seen)
 
 
 def decide(
     controller: Any, parameters: Any, memory: Any, observation: Any, reason: jax.Array, key: jax.Array
 ) -> tuple[Any, Any]:
-    """Memory and action of one episode, of a `simulator.SetpointController` that sees a
-    `simulator.Observation`. Memory stays as it was if the window is held. The action counts if the reason is
-    ACTS; whoever sends it looks."""
+    """Returns memory and action of one episode, from a `simulator.SetpointController` and a
+    `simulator.Observation`. Memory is kept as it was unless the reason is ACTS. The action is valid only if
+    the reason is ACTS; the caller must check this."""
     after, action = controller.act(parameters, memory, observation, key)
     return jax.tree.map(lambda new, old: jnp.where(reason == ACTS, new, old), after, memory), action
 
@@ -46,8 +47,8 @@ def decide(
 
 
 class SetpointLimits(NamedTuple):
-    """Of (flow in percent, target temperature in °C), each (2,): the box, the largest change of one action
-    and the travel allowed in any 60 s."""
+    """Limits of (flow in percent, target temperature in °C), each (2,): the range, the largest change of one
+    action, and the total travel allowed in any 60 s."""
 
     low: np.ndarray
     high: np.ndarray
@@ -56,9 +57,9 @@ class SetpointLimits(NamedTuple):
 
 
 class Setpoints(NamedTuple):
-    """Setpoints as sent, value (..., 2); the last H moves, times (..., H) in s and moves (..., H, 2), oldest
-    first; `clipped` (..., 4) counts how often the size of one action, the travel of a minute or the box cut a
-    change, and how often it was no number."""
+    """Setpoints as sent: `value` (..., 2); the last H moves, `times` (..., H) in s and `moves` (..., H, 2),
+    oldest first. `clipped` (..., 4) counts how often the size of one action, the travel of a minute or the
+    range cut a change, and how often a change was no number."""
 
     value: Any
     times: Any
@@ -67,7 +68,7 @@ class Setpoints(NamedTuple):
 
 
 def setpoints(start: np.ndarray, limits: SetpointLimits) -> Setpoints:
-    """Setpoints at rest at start (E, 2). Raises ValueError where a start lies outside the box."""
+    """Returns setpoints at rest at start (E, 2). Raises ValueError if a start lies outside the range."""
     start = np.asarray(start, float)
     outside = ~((start >= limits.low) & (start <= limits.high)).all(axis=1)
     if outside.any():
@@ -80,7 +81,8 @@ def setpoints(start: np.ndarray, limits: SetpointLimits) -> Setpoints:
 
 
 def at_rest(value, *, remembered: int) -> Setpoints:
-    """Setpoints value (..., 2) that did not move in the last minute, with room for so many moves."""
+    """Returns setpoints `value` (..., 2) that did not move in the last minute, with room for `remembered`
+    moves."""
     xp, lead = value.__array_namespace__(), value.shape[:-1]
     return Setpoints(
         value,
@@ -91,11 +93,11 @@ def at_rest(value, *, remembered: int) -> Setpoints:
 
 
 def moved(state: Setpoints, change, time_s, limits: SetpointLimits) -> Setpoints:
-    """The setpoints after the wanted change (..., 2) at time_s (...,), cut to the size of one action, to what
-    is left of the last 60 s' travel, and to the box.
+    """Returns the setpoints after the requested change (..., 2) at time_s (...,). The change is limited to
+    the size of one action, to the travel left of the last 60 s, and to the range.
 
-    A change that is no number moves nothing, and neither does one while more moves than are remembered lie
-    within 60 s. Every cut is counted.
+    Nothing moves if a change is no number, or if the oldest remembered move still lies within 60 s. Every cut
+    is counted.
     """
     xp = state.value.__array_namespace__()
     number = xp.isfinite(change).all(axis=-1)
@@ -121,8 +123,8 @@ def moved(state: Setpoints, change, time_s, limits: SetpointLimits) -> Setpoints
 
 
 class Waits(NamedTuple):
-    """Seconds to the next window after an action that moved the flow,
-    that moved the temperature, that moved nothing."""
+    """Seconds to the next window after an action that moved the flow, that moved the temperature, or that
+    moved nothing."""
 
     flow_s: float | jax.Array
     temperature_s: float | jax.Array
@@ -130,8 +132,8 @@ class Waits(NamedTuple):
 
 
 def wait_after(change, waits: Waits):
-    """Seconds (...,) to wait after the changes (..., 2) that were really
-    sent: the longest that any of them asks for."""
+    """Returns the seconds (...,) to wait after the changes (..., 2) that were actually sent: the longest wait
+    that applies."""
     xp = change.__array_namespace__()
     moves = change != 0
     asked = xp.maximum(moves[..., 0] * waits.flow_s, moves[..., 1] * waits.temperature_s)

@@ -1,11 +1,11 @@
-"""Windows recorded from a trained classifier as a source for the simulator: whole windows are drawn again, so
-errors sit, stick and mislead as the classifier's do.
+"""Windows recorded from a trained classifier, as a source for the simulator. Whole windows are drawn again,
+so their errors have the size, the persistence and the bias of the classifier's errors.
 
-Of a table of classes only: given a true flow, a segment of its flow bin is taken, and of that segment any
-window. Conditions persist: within a bin the segments are ranked by how much they look over-extruded (mean
-p_2 - p_0), and an episode keeps its rank for a while, also when the flow moves to another bin, so that what
-looks thin here looks thin there. Of a table with flows an error is drawn: that of a segment, which persists
-in the same way, and about it that of any of the NEAREST windows recorded at flows like this one.
+If the table has classes only, a segment in the bin of the true flow is taken, and any window of that segment.
+Conditions persist: within a bin, segments are ranked by how over-extruded they look (mean p_2 - p_0). An
+episode keeps its rank for a while, also when the flow moves to another bin, so what looks thin in one bin
+looks thin in the next. If the table has flows, an error is drawn as a sum: the error of a segment, which
+persists in the same way, and the error about it of any of the NEAREST windows recorded at similar flows.
 """
 
 import collections
@@ -18,19 +18,19 @@ import numpy as np
 
 from pipeline.setpoint.simulation.simulator import GOOD_BORDERS, EpisodeConditions, WindowSource
 
-UNSEEN = np.array(np.nan)  # of a table of classes only
-DITHER = 1e-3  # of log flow_seen: a window drawn twice is not a picture that stands still
+UNSEEN = np.array(np.nan)  # value in a table of classes only
+DITHER = 1e-3  # added to log flow_seen, so that a window drawn twice does not look like a frozen picture
 
 
 class WindowTable(NamedTuple):
-    """n windows of a classifier: shares p (n, 3) of under, good, over, sum 1; named class (n,) 0, 1, 2;
-    flow_bin (n,) 0 .. bins - 1; segment (n,) any integers.
+    """n windows of a classifier: shares p (n, 3) of under, good and over, sum 1; `named` class (n,) 0, 1, 2;
+    `flow_bin` (n,) 0 .. bins - 1; `segment` (n,) any integers.
 
-    flow_edges (bins + 1,) in percent, rising; flows outside take the outermost bin. Every bin needs a window;
-    a segment may occur in one bin or in many. Bins of 2.5 % from 70 to 130 % and wider ones beyond let a
-    controller find 100 % within the good class. flow_seen (n,) is the flow that a window shows, spread (n,)
-    the deviation of its logarithm, flow (n,) the true one, both in percent of nominal: all three NaN where
-    the classifier names classes only.
+    `flow_edges`: (bins + 1,) in percent, rising; flows outside belong to the outermost bin. Every bin needs a
+    window; a segment may occur in one bin or in many. Bins of 2.5 % from 70 to 130 %, and wider ones beyond,
+    let a controller find 100 % within the good class. `flow_seen` (n,): flow that a window shows; `spread`
+    (n,): standard deviation of its logarithm; `flow` (n,): the true one; both flows in percent of nominal.
+    All three are NaN if the classifier gives classes only.
     """
 
     shares: np.ndarray
@@ -44,18 +44,19 @@ class WindowTable(NamedTuple):
 
 
 def with_flows(table: WindowTable) -> bool:
-    """Whether the windows show flows, not classes only."""
+    """Returns whether the windows show flows, not only classes."""
     return bool(np.isfinite(table.flow_seen).all())
 
 
-NEAREST = 40  # windows that an error is drawn from, or all where there are fewer
+NEAREST = 40  # windows from which an error is drawn; all if there are fewer
 
 
 class _Ranked(NamedTuple):
-    """Windows sorted by bin, then by the rank of their segment: segments of bin b are first_segment[b] + 0 ..
-    segments[b] - 1, their windows likewise. Of those that show flows, sorted by log_flow (n,): their errors
-    about their segments (n,) and spread (n,); and bias (segments,) of the segments, rising. seen: how many of
-    these windows and biases there are, as what a redraw is filled up with behind them is none."""
+    """Windows sorted by bin, then by the rank of their segment. Bin b has segments first_segment[b] + 0 ..
+    segments[b] - 1, and a segment's windows are counted in the same way. If windows show flows, then sorted
+    by `log_flow` (n,): their errors about their segments (n,) and `spread` (n,); and the segments' `bias`
+    (segments,), ascending. `seen`: number of these windows and of biases; entries behind them are padding and
+    are never drawn."""
 
     shares: jax.Array
     named: jax.Array
@@ -72,23 +73,27 @@ class _Ranked(NamedTuple):
 
 
 class SegmentErrors(NamedTuple):
-    """Errors log flow_seen / flow of a table's windows, in two parts: within (n,), of each window about its
-    segment, with the camera's mean error at its flow; bias (segments,) of the segments, their number of
-    windows shrunk away, and its deviation bias_std."""
+    """Errors log flow_seen / flow of a table's windows, in two parts. `within` (n,): each window about its
+    segment, including the camera's mean error at its flow. `bias` (segments,): of the segments, shrunk for
+    their number of windows; `bias_std`: its standard deviation."""
 
     within: np.ndarray
     bias: np.ndarray
     bias_std: float
 
 
-# segments that the declared deviation counts for, beside the table's own
+# number of segments that the declared deviation weighs, besides the table's own
 DECLARED_SEGMENTS = 5
 
 
 def segment_errors(table: WindowTable, *, width_bias_std: float) -> SegmentErrors:
-    """The errors of a table that shows flows, by a one-way analysis of variance: s_b^2 = var(segment means) -
-    s_w^2 mean(1 / n_s), pooled with the declared width_bias_std^2. A segment that stands at one flow only
-    cannot tell its bias from what the camera does at that flow: errors are taken about the smoothed mean."""
+    """Splits the errors of a table that shows flows by a one-way analysis of variance,
+
+        s_b^2 = var(segment means) - s_w^2 mean(1 / n_s),
+
+    pooled with the declared width_bias_std^2. If a segment has one flow only, its bias cannot be told from
+    the camera's error at that flow, so errors are taken about the smoothed mean.
+    """
     log_flow = np.log(table.flow)
     error = np.log(table.flow_seen) - log_flow
     mean = smooth_mean(log_flow, error)
@@ -97,7 +102,7 @@ def segment_errors(table: WindowTable, *, width_bias_std: float) -> SegmentError
     segment_mean = np.bincount(place, about) / counts
     within = about - segment_mean[place]
     free = len(error) - len(counts)
-    if free <= 0:  # one window a segment: nothing parts the two
+    if free <= 0:  # one window for each segment: the two parts cannot be separated
         return SegmentErrors(error, np.zeros(1), width_bias_std)
     variance = (within**2).sum() / free
     between = max(0.0, float((segment_mean**2).mean() - variance * (1 / counts).mean()))
@@ -108,18 +113,19 @@ def segment_errors(table: WindowTable, *, width_bias_std: float) -> SegmentError
     return SegmentErrors(mean + within * inflate, own, float(bias_std))
 
 
-MEAN_BANDWIDTH = 0.08  # of log flow, one deviation: over which a camera's mean error is smooth
+MEAN_BANDWIDTH = 0.08  # bandwidth in log flow (one deviation) over which a camera's mean error is smoothed
 
 
 def smooth_mean(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The kernel mean (n,) of y over x, read at every x."""
+    """Returns the kernel mean (n,) of y over x, evaluated at every x."""
     at = np.linspace(x.min(), x.max(), 200)
     weight = np.exp(-0.5 * ((at[:, None] - x) / MEAN_BANDWIDTH) ** 2)
     return np.interp(x, at, (weight @ y) / np.maximum(weight.sum(axis=1), 1e-12))
 
 
 def recorded_windows(table: WindowTable) -> WindowSource:
-    """The table as a source of windows: fresh where conditions.persistence is 1, sticky above."""
+    """Returns the table as a source of windows. With conditions.persistence 1 each window is of a new
+    segment; above 1 the segment persists. Raises ValueError if the table is not complete and consistent."""
     _check(table)
     shares, bins = np.asarray(table.shares, np.float32), len(table.flow_edges) - 1
     pairs, place = np.unique(np.stack([table.flow_bin, table.segment], axis=1), axis=0, return_inverse=True)
@@ -150,7 +156,7 @@ def recorded_windows(table: WindowTable) -> WindowSource:
 
 
 def _errors(table: WindowTable) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """log_flow, error, spread and bias as _Ranked has them; NaN of a table of classes only."""
+    """Returns log_flow, error, spread and bias as in _Ranked; NaN if the table has classes only."""
     if not with_flows(table):
         none = np.full(1, np.nan)
         return none, none, none, none
@@ -179,8 +185,8 @@ def _recorded_draw(
 
 
 def class_shares(flow_seen: jax.Array, spread: jax.Array) -> jax.Array:
-    """(..., 3): P(flow < 90 %), P(90 to 110 %), P(> 110 %) where log flow ~ N(log flow_seen, spread^2);
-    flow_seen in percent, both (...)."""
+    """Returns P(flow < 90 %), P(90 to 110 %) and P(> 110 %) (..., 3) if log flow ~ N(log flow_seen,
+    spread^2). `flow_seen` in percent; both arguments (...)."""
     low, high = (
         jax.scipy.special.ndtr((jnp.log(border) - jnp.log(flow_seen)) / spread) for border in GOOD_BORDERS
     )
@@ -235,8 +241,8 @@ def _check(table: WindowTable) -> None:
 
 
 def window_rows(tables: Mapping[str, WindowTable]) -> dict[str, np.ndarray]:
-    """Tables by part as columns of schema WINDOWS; flows are missing of a classifier that names
-    classes only."""
+    """Returns the tables, by part, as columns of schema WINDOWS. Flows are missing (NaN) if the classifier
+    gives classes only."""
     columns = collections.defaultdict(list)
     for part, table in tables.items():
         columns["part"] += [part] * len(table.named)
@@ -254,7 +260,8 @@ def window_rows(tables: Mapping[str, WindowTable]) -> dict[str, np.ndarray]:
 
 
 def window_tables(columns: Mapping[str, np.ndarray], parts: Sequence[str]) -> dict[str, WindowTable]:
-    """The reverse of `window_rows`. Raises ValueError if one of the parts has no window."""
+    """Returns the tables of these columns by part, the reverse of `window_rows`. Raises ValueError if a part
+    has no window."""
     tables = {}
     for part in parts:
         rows = np.asarray(columns["part"] == part)

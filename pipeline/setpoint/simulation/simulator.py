@@ -1,16 +1,16 @@
-"""The printer as a controller of setpoints meets it: the paper's simulator (Li and Pattinson 2025, eqs. 5-9),
-a clog in mid-episode, and rollouts.
+"""The printer as a setpoint controller sees it: the paper's simulator (Li and Pattinson 2025, eqs. 5-9), a
+clog during an episode, and rollouts.
 
-One decision is one window of frames. At step t the controller sees an
-`Observation` and answers with an `Action`; then
+Each decision is made on one window of frames. At step t the controller gets an `Observation` and answers with
+an `Action`; then
 
     q_bar <- clip(q_bar + a_q, 20, 310)     q = q_bar, clog q_bar from clog_step on
     u_bar <- clip(u_bar + a_u, 180, 240)    if t mod lambda = 0
     u_hat <- u_hat + (u_bar - u_hat) / delta
 
-What may be sent and how long to wait is `actuation`'s, as in the loop through pixels. The commanded flow
-acts at once, and the class depends alone on the true flow q of what the picture shows. What a window shows
-for a flow comes from a `WindowSource`: `paper_windows()` here, or windows recorded from a trained classifier
+`actuation` limits what is sent and sets the waits, as in the loop through pixels. The commanded flow acts at
+once, and the class depends only on the true flow q of what the picture shows. A `WindowSource` gives the
+window for a flow: `paper_windows()` here, or windows recorded from a trained classifier
 (`recorded.recorded_windows`). Flow is in percent of nominal, temperature in °C.
 """
 
@@ -38,12 +38,12 @@ from pipeline.setpoint.simulation.actuation import SetpointLimits, Setpoints
 
 STAND = 2  # the index of no move
 FLOW_LIMITS, TEMPERATURE_LIMITS = (20.0, 310.0), (180.0, 240.0)
-LIMITS = SetpointLimits(  # of what is sent: the largest change of one action, and of 60 s
+LIMITS = SetpointLimits(  # range, then the largest change in one action, and in 60 s
     *(np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True)),
     np.array([10.0, 20.0]),
     np.array([100.0, 60.0]),
 )
-REMEMBERED = 16  # actions of the last 60 s that limits are of: one takes at least 4 s
+REMEMBERED = 16  # actions remembered for the 60 s limit: each takes at least 4 s
 WINDOW_S = 1.0
 HISTORY, CLASSES = 30, 3  # eta and n_c of (8)
 UNDER, GOOD, OVER = 0, 1, 2
@@ -52,13 +52,14 @@ CHANCES = 5  # uniform numbers that a decision takes: three for its window, two 
 
 
 class Observation(NamedTuple):
-    """What the machine shows at a decision. The true flow is not among it, nor a setpoint that would give it
-    away: only moves of the flow setpoint mean something.
+    """What the controller knows at a decision. It gets neither the true flow nor a setpoint that would reveal
+    it: only changes of the flow setpoint are meaningful.
 
-    shares (3,) of under, good, over in the window, sum 1; named is the window's class 0, 1, 2; flow_seen the
-    flow that it shows, percent of nominal, NaN of a camera that shows classes only; flow_move
-    (percent) is how far the flow setpoint moved since the controller's last observation, as executed after
-    limits (0 after a hold); temperature u_hat and target u_bar in °C; step t counts decisions, held ones too.
+    `shares` (3,): of under, good and over in the window, sum 1. `named`: the window's class 0, 1, 2.
+    `flow_seen`: flow that the window shows, in percent of nominal; NaN if the camera shows classes only.
+    `flow_move`: change of the flow setpoint since the controller's last observation, in percent, after
+    limits. `temperature`: u_hat; `target`: u_bar, in °C. `step`: t, counts decisions; with a real or rendered
+    camera, only those that led to an action.
     """
 
     shares: jax.Array
@@ -71,28 +72,28 @@ class Observation(NamedTuple):
 
 
 class Action(NamedTuple):
-    """Indices 0..4 into FLOW_MOVES and TEMPERATURE_MOVES; the
-    temperature's counts only where step mod LAMBDA = 0."""
+    """Indices 0..4 into FLOW_MOVES and TEMPERATURE_MOVES. The temperature's index is applied only if step mod
+    LAMBDA = 0."""
 
     flow: jax.Array
     temperature: jax.Array
 
 
 class SetpointController(NamedTuple):
-    """start() -> memory; act(parameters, memory, observation, key) -> (memory, action). Both pure, for one
-    episode: vmap over episodes, scan over steps."""
+    """A pair of pure functions for one episode: start() -> memory; act(parameters, memory, observation, key)
+    -> (memory, action). Use vmap over episodes and scan over steps."""
 
     start: Callable[[], Any]
     act: Callable[[Any, Any, Observation, jax.Array], tuple[Any, Action]]
 
 
 class EpisodeConditions(NamedTuple):
-    """One episode's start and machine: scalars, or arrays (n,) with one entry an episode.
+    """Start and machine of one episode: scalars, or arrays (n,) with one entry for each episode.
 
-    flow (percent) and temperature (°C) at the start; accuracy rho of the paper's windows; persistence:
-    decisions that a recorded segment lasts on average, 1 is fresh; clog: factor on the flow from clog_step
-    on, 1 is none; wait_s after every action; view_s: time after a move until all that a picture shows was
-    laid since, 0 is at once.
+    `flow` (percent) and `temperature` (°C): at the start. `accuracy`: rho of the paper's windows.
+    `persistence`: mean number of decisions that a recorded segment lasts; 1: a new segment at each decision.
+    `clog`: factor on the flow from `clog_step` on; 1: no clog. `wait_s`: after every action. `view_s`: time
+    after a move until the picture shows only material laid since; 0: at once.
     """
 
     flow: jax.Array
@@ -106,9 +107,9 @@ class EpisodeConditions(NamedTuple):
 
 
 class MachineState(NamedTuple):
-    """sent: what the moves reach, (q_bar before a clog, u_bar), and the moves of the last minute; flow: the
-    true q; segment in [0, 1): the recorded conditions that persist, as a rank among segments; step counts
-    decisions."""
+    """`sent`: setpoints (q_bar before a clog, u_bar), and the moves of the last minute; `flow`: the true q;
+    `segment` in [0, 1): the recorded conditions that persist, as a rank among segments; `step`: decisions so
+    far."""
 
     sent: Setpoints
     flow: jax.Array
@@ -123,9 +124,9 @@ class MachineState(NamedTuple):
 
 
 class WindowSource(NamedTuple):
-    """draw(table, conditions, flow, segment, u) -> shares (3,), named, flow_seen (percent; NaN where the
-    camera shows classes only): a window at the true flow, from uniform numbers u (3,) and the arrays of
-    `table`."""
+    """Draws windows: draw(table, conditions, flow, segment, u) -> shares (3,), named, flow_seen (percent; NaN
+    if the camera shows classes only). A window at the true flow follows from uniform numbers u (3,) and the
+    arrays of `table`."""
 
     draw: Callable[
         [Any, EpisodeConditions, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array, jax.Array]
@@ -134,8 +135,8 @@ class WindowSource(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """n episodes of T decisions: true flow, temperature and target (n, T + 1) with the start first; named (n,
-    T), shares (n, T, 3) and action (n, T) as asked, of each decision."""
+    """n episodes of T decisions. `flow` (true), `temperature` and `target` (n, T + 1), with the start first.
+    For each decision: `named` (n, T), `shares` (n, T, 3) and `action` (n, T) as requested."""
 
     flow: jax.Array
     temperature: jax.Array
@@ -146,13 +147,13 @@ class Trajectory(NamedTuple):
 
 
 def flow_class(flow: jax.Array) -> jax.Array:
-    """0 under 90 %, 1 from 90 to 110 %, 2 above."""
+    """Returns the class of a flow: 0 under 90 %, 1 from 90 to 110 %, 2 above."""
     return jnp.where(flow < GOOD_BORDERS[0], UNDER, jnp.where(flow > GOOD_BORDERS[1], OVER, GOOD))
 
 
 def nominal(flow, temperature, *, accuracy: float) -> EpisodeConditions:
-    """Conditions of a machine that does as it is told, from starts flow (n,) and
-    temperature (n,); `_replace` what an episode is to meet."""
+    """Returns conditions of a machine without disturbances, that starts at flow (n,) and temperature (n,).
+    Add disturbances with `_replace`."""
     flow = jnp.asarray(flow, float)
     one, zero = jnp.ones_like(flow), jnp.zeros_like(flow)
     ones = dict.fromkeys(("persistence", "clog"), one)
@@ -169,8 +170,11 @@ def nominal(flow, temperature, *, accuracy: float) -> EpisodeConditions:
 
 
 def paper_windows() -> WindowSource:
-    """(7): the class is right with probability rho, else one of the others; p_i = clip(exp(-alpha |i - x0|) +
-    N(0, sigma^2), 0, 1) for i != x0, 1 at x0; over their sum. It shows classes only."""
+    """Returns the windows of (7), which show classes only. The class x0 is right with probability rho,
+    otherwise one of the two others. The shares are p_i over their sum, with
+
+        p_i = clip(exp(-alpha |i - x0|) + N(0, sigma^2), 0, 1) for i != x0,    p_x0 = 1
+    """
     return WindowSource(_paper_draw)
 
 
@@ -184,20 +188,20 @@ def _paper_draw(
     z = _normal(u[1:])
     noise = SIGMA * jnp.stack(
         [z[0], jnp.where(x0 == 0, z[0], z[1]), z[1]]
-    )  # two numbers serve, as x0 itself takes none
+    )  # two random numbers suffice, since x0 itself needs none
     prob = jnp.where(distance == 0, 1.0, jnp.clip(jnp.exp(-ALPHA * distance) + noise, 0.0, 1.0))
     return prob / prob.sum(), x0, jnp.full_like(u[0], jnp.nan)
 
 
 def _normal(u: jax.Array) -> jax.Array:
-    """N(0, 1) from numbers uniform in [0, 1)."""
+    """Converts numbers uniform in [0, 1) to N(0, 1)."""
     return jnp.sqrt(2.0) * jax.lax.erf_inv(jnp.clip(2.0 * u - 1.0, -1.0 + 1e-6, 1.0 - 1e-6))
 
 
 def begin(
     windows: WindowSource, conditions: EpisodeConditions, key: jax.Array
 ) -> tuple[MachineState, Observation]:
-    """The state and first observation of one episode (scalar conditions)."""
+    """Returns the state and the first observation of one episode (scalar conditions)."""
     return _begun(windows, conditions, jax.random.uniform(key, (CHANCES,)))
 
 
@@ -222,10 +226,10 @@ def _begun(
 def stepped(
     windows: WindowSource, conditions: EpisodeConditions, state: MachineState, action: Action, u: jax.Array
 ) -> tuple[MachineState, Observation]:
-    """One decision of one episode: the action, the limits and lags, and the next window. The reward is
-    `reward(state.flow, state.temperature, ...)`.
+    """Simulates one decision of one episode: the action, the limits and lags, and the next window. The reward
+    is `reward(state.flow, state.temperature, ...)`.
 
-    u (CHANCES,) are the chances, uniform in [0, 1), which the caller draws for many at once.
+    `u` (CHANCES,): random numbers, uniform in [0, 1), which the caller draws for many episodes at once.
     """
     heeded = state.step % LAMBDA == 0
     target_move = jnp.where(heeded, jnp.asarray(TEMPERATURE_MOVES)[action.temperature], 0.0)
@@ -234,7 +238,7 @@ def stepped(
     change, step = sent.value - state.sent.value, state.step + 1
     wait_s = actuation.wait_after(change, actuation.Waits(*3 * (conditions.wait_s,)))
     flow = jnp.where(step >= conditions.clog_step, conditions.clog, 1.0) * sent.value[0]
-    # of what the window's middle shows, the share that was laid before the move
+    # fraction of the material visible in the middle of the window that was laid before the move
     before = jnp.clip(1.0 - (wait_s + WINDOW_S / 2) / jnp.maximum(conditions.view_s, 1e-3), 0.0, 1.0)
     shown = flow + (state.flow - flow) * before
     state = MachineState(
@@ -256,24 +260,25 @@ def _observed(
     flow_move: jax.Array,
     u: jax.Array,
 ) -> Observation:
-    """What the camera shows of this flow, after this move of its setpoint."""
+    """Returns what the camera shows of this flow, after this move of its setpoint."""
     shown = windows.draw(windows.table, conditions, flow, state.segment, u[:3])
     return Observation(*shown, flow_move, state.temperature, state.target, state.step)
 
 
 def first_history(length: int = HISTORY) -> jax.Array:
-    """(8) at the start: eta classes as if all had been good, 1 / n_c each; oldest first."""
+    """Returns the history (8) at the start, oldest first: eta classes as if all had been good, 1 / n_c
+    each."""
     return jnp.full(length, 1.0 / CLASSES)
 
 
 def remembered(history: jax.Array, named: jax.Array) -> jax.Array:
-    """The history (30,) with the newest class x as x / n_c at its end (8)."""
+    """Returns the history (eta,) with the newest class x appended as x / n_c (8)."""
     return jnp.append(history[1:], named / CLASSES)
 
 
 def paper_state(history: jax.Array, observation: Observation) -> jax.Array:
-    """The state (35,) of (9): 30 former classes by n_c, oldest first,
-    p_hat with its largest at 1, u_hat, u_bar (°C)."""
+    """Returns the state (35,) of (9): 30 former classes divided by n_c, oldest first; p_hat, scaled to a
+    largest value of 1; u_hat and u_bar (°C)."""
     p_hat = observation.shares / observation.shares.max()
     return jnp.concatenate([history, p_hat, jnp.stack([observation.temperature, observation.target])])
 
@@ -287,12 +292,12 @@ def rollout(
     *,
     steps: int,
 ) -> Trajectory:
-    """Every episode of `conditions` (n,) for `steps` decisions: one
-    compiled program, the same key the same bytes."""
+    """Simulates every episode of `conditions` (n,) for `steps` decisions in one compiled program. The same
+    key gives identical results."""
     n = conditions.flow.shape[0]
-    own, world = jax.random.split(key)  # the controller's chance is not the world's
-    # chance is drawn outside of the program, as its generator takes longer to compile than the rest; so are
-    # the first windows, which are the same program for every controller
+    own, world = jax.random.split(key)  # separate random numbers for controller and machine
+    # random numbers are drawn outside of the program, because their generator takes longer to compile than
+    # the rest; so are the first windows, with one program for every controller
     u = jax.random.uniform(world, (steps + 1, n, CHANCES))
     first = _first(windows, conditions, u)
     return _rolled(controller, parameters, windows, conditions, jax.random.split(own, n), first, u)
@@ -350,11 +355,11 @@ def _rolled(
 
 
 def reward(flow: jax.Array, temperature: jax.Array, *, a: float, b: float) -> jax.Array:
-    """The paper's elliptical reward (Li and Pattinson 2025, eqs. 14-16):
-    r = 2 / (1 + sqrt(q_r^2 / a^2 + u_r^2 / b^2)) - 1 in (-1, 1], 1 at (q*, u*) = (100 %, 210 °C); flow in
-    percent, temperature in °C, any one shape.
+    """Returns the paper's elliptical reward (Li and Pattinson 2025, eqs. 14-16), in (-1, 1], 1 at (q*, u*) =
+    (100 %, 210 °C). `flow` in percent, `temperature` in °C, of any one shape.
 
-    q_r = (q - q*) cos theta - (u - u*) sin theta,   u_r = (q - q*) sin theta + (u - u*) cos theta
+        r = 2 / (1 + sqrt(q_r^2 / a^2 + u_r^2 / b^2)) - 1
+        q_r = (q - q*) cos theta - (u - u*) sin theta,   u_r = (q - q*) sin theta + (u - u*) cos theta
     """
     dq, du = flow - BEST_FLOW, temperature - BEST_TEMPERATURE
     q_r = dq * jnp.cos(ROTATION) - du * jnp.sin(ROTATION)

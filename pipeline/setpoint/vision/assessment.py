@@ -1,4 +1,5 @@
-"""What the trained classifier is worth on frames that it has not seen, beside its yardsticks."""
+"""How good the trained classifier is on frames that it has not seen, compared with simpler reference
+methods."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -15,21 +16,21 @@ from pipeline.setpoint.vision.classifier import Labelled, TrainState
 from pipeline.setpoint.vision.parts import all_frames
 from pipeline.setpoint.vision.proof import may_judge, verdict
 
-# yardsticks learn from one frame in so many: they take ten times as long a frame
+# reference methods learn from one frame in EVERY, because they take ten times as long for each frame
 EVERY = 3
 
 
 class Assessment(NamedTuple):
-    """The classifier on the frames that it is judged on, none of which it had learned from."""
+    """The classifier's results on test frames; it learned from none of them."""
 
     fitted: ClassifierCalibration
-    frames: ClassifierOutputs  # of the classifier on them, rejected ones too
+    frames: ClassifierOutputs  # the classifier's outputs on these frames, including rejected ones
     windows: WindowPredictions
-    yardsticks: dict[str, np.ndarray]  # (n,) classes named by simpler ways, by name; none of few own pictures
+    yardsticks: dict[str, np.ndarray]  # (n,) classes by reference method; empty for few own pictures
 
 
 def fewer(learned: Labelled) -> Labelled:
-    """One frame in EVERY of each class: what the yardsticks learn from."""
+    """Returns one frame in EVERY of each class, from which the reference methods learn."""
     of_class = (np.flatnonzero(learned.label == c)[::EVERY] for c in range(3))
     return learned.take(np.sort(np.concatenate([*of_class])))
 
@@ -42,14 +43,16 @@ def assess(
     *,
     window: int,
 ) -> Assessment:
-    """The classifier's `outputs` on the frames `data`, beside yardsticks that learn from `learned`."""
+    """Returns the assessment of the classifier's `outputs` on the frames `data`, compared with reference
+    methods that learn from `learned`."""
     windows = calibrated_classifier.window_predictions(fitted, outputs, length=window)
     others = calibrated_classifier.yardstick_classes(fewer(learned), data)
     return Assessment(fitted, outputs, windows, others)
 
 
 def figures(of: Assessment) -> dict[str, Any]:
-    """Accuracies with their 95 % intervals by segment, also by flow; calibration; whether it may judge."""
+    """Returns accuracies with their 95 % intervals by segment, also by flow; calibration errors; and whether
+    the classifier may be used for control."""
     frames, valid, proof = of.frames, of.frames.valid, of.fitted.proof
     named = {"image": frames.logits.argmax(axis=1)}
     named |= {f"{name}_image": classes for name, classes in of.yardsticks.items()}
@@ -82,7 +85,7 @@ def figures(of: Assessment) -> dict[str, Any]:
 
 
 def judged_windows(windows: WindowPredictions) -> tuple[np.ndarray, WindowTruth]:
-    """Probabilities (w, 3) and truth of the windows that have a valid frame."""
+    """Returns probabilities (w, 3) and truth of the windows that have a valid frame."""
     some = windows.any_valid
     return windows.seen.prob[some], WindowTruth(*(column[some] for column in windows.truth))
 
@@ -95,9 +98,10 @@ def proven(
     known_from: int,
     rendered: bool,
 ) -> ClassifierCalibration:
-    """The calibration with what windows of segments or prints that nothing was learned from prove of it. A
-    window names the class in which the flow seen lies, by which the loop steers: of three probabilities that
-    of good, the narrowest, is never the largest if the spread is wide."""
+    """Returns the calibration with its proof, from windows of segments or prints that were not learned from.
+    The class of a window is the one in which its flow seen lies, because the loop acts on this flow. The most
+    probable class would not do: that of good is the narrowest, and if the spread is wide, it is never the
+    largest."""
     _, truth = judged_windows(windows)
     named = label(windows.seen.flow_seen[windows.any_valid])
     proof = calibration.prove(named, truth, least=least, known_from=known_from, rendered=rendered)
@@ -105,12 +109,12 @@ def proven(
 
 
 def _finite(row: NamedTuple) -> dict[str, float | None]:
-    """A row for JSON: None if there is no figure."""
+    """Returns a row for JSON, with None for figures that are not finite."""
     return {name: value if np.isfinite(value) else None for name, value in row._asdict().items()}
 
 
 def classified(of: Assessment) -> dict[str, np.ndarray]:
-    """Columns of schema CLASSIFIED: the valid frames of the judged part."""
+    """Returns columns of schema CLASSIFIED: the valid frames of the test part."""
     frames, fitted = of.frames, of.fitted
     prob = np.clip(np.exp(calibration.log_probabilities(frames.logits, fitted.temperature)), 0, 1)
     columns = {
@@ -125,7 +129,7 @@ def classified(of: Assessment) -> dict[str, np.ndarray]:
 
 
 def reliability(of: Assessment) -> dict[str, list]:
-    """Columns of schema RELIABILITY."""
+    """Returns columns of schema RELIABILITY."""
     columns: dict[str, list] = {
         name: [] for name in ("of", "method", "low", "high", "count", "confidence", "accuracy")
     }
@@ -139,7 +143,8 @@ def reliability(of: Assessment) -> dict[str, list]:
 
 
 def window_tables(windows: Mapping[str, WindowPredictions]) -> dict[str, WindowTable]:
-    """The windows of each part as the simulator draws them again, in bins of the flow that all parts have."""
+    """Returns the windows of each part as tables from which the simulator draws, in flow bins that all parts
+    have."""
     bins = flow_edges([of.truth.flow_percent[of.any_valid] for of in windows.values()])
     return {
         part: calibration.recorded(of.seen, of.truth.flow_percent, of.truth.segment, flow_edges=bins)
@@ -150,14 +155,15 @@ def window_tables(windows: Mapping[str, WindowPredictions]) -> dict[str, WindowT
 def predict_windows(
     model: CalibratedClassifier, frames: LabelledFrames, *, window: int, recorded: bool
 ) -> WindowPredictions:
-    """What the model says of windows of the frames of rendered segments, or of recorded prints."""
+    """Returns the model's predictions for windows of rendered segments, or of recorded prints."""
     data = all_frames(frames, recorded=recorded)
     outputs = calibrated_classifier.outputs(model.network, data, frames.valid, frames.surroundings)
     return calibrated_classifier.window_predictions(model.calibration, outputs, length=window)
 
 
 def curve(state: TrainState | None) -> dict[str, list]:
-    """Columns of schema CLASSIFIER_CURVE: a row for each epoch of the network, if it was trained."""
+    """Returns columns of schema CLASSIFIER_CURVE: a row for each epoch if the network was trained, else no
+    row."""
     history = [] if state is None else np.asarray(state.history, float)[: int(state.epoch)].tolist()
     rows = [("vision transformer", epoch + 1, *row) for epoch, row in enumerate(history)]
     names = ("learner", "epoch", "training_loss", "held_out_loss", "held_out_accuracy")

@@ -1,5 +1,5 @@
-"""A classifier with its calibration: class probabilities of key areas and of windows, and how far a key area
-is from what was learned."""
+"""A classifier with its calibration: class probabilities of key areas and of windows, and the distance of a
+key area from what was learned."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -29,8 +29,9 @@ class CalibratedClassifier(NamedTuple):
 
 
 class FrameReadings(NamedTuple):
-    """Of n key areas: class probabilities (n, 3), how foreign each is (n,), log(flow / 100 %) (n,) and its
-    deviation (n,) as the network gives them; calibration.window_flow makes a window's flow of them."""
+    """For n key areas: class probabilities (n, 3); distance, how unfamiliar each is (n,); log(flow / 100 %)
+    (n,) and its standard deviation (n,) as the network gives them. calibration.window_flow combines them into
+    a window's flow."""
 
     prob: np.ndarray
     distance: np.ndarray
@@ -41,8 +42,8 @@ class FrameReadings(NamedTuple):
 def read_frames(
     model: CalibratedClassifier, images: np.ndarray, temperature_degC: np.ndarray
 ) -> FrameReadings:
-    """What key areas (n, 16, 48) at temperatures (n,) show; the distance is the squared Mahalanobis distance
-    of features and appearance from those learned."""
+    """Returns what key areas (n, 16, 48) at temperatures (n,) show. The distance is the squared Mahalanobis
+    distance of features and appearance from those learned."""
     prediction = predict(model.network, images, temperature_degC)
     prob = np.exp(calibration.log_probabilities(prediction.logits, model.calibration.temperature))
     features = np.hstack([prediction.features, calibration.appearance(images)])
@@ -57,14 +58,14 @@ def read_frames(
 def classify(
     model: CalibratedClassifier, images: np.ndarray, temperature_degC: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Class probabilities (n, 3) of key areas (n, 16, 48) at temperatures (n,), and how foreign each is
-    (n,), as `read_frames` says."""
+    """Returns class probabilities (n, 3) of key areas (n, 16, 48) at temperatures (n,), and how unfamiliar
+    each is (n,), as `read_frames`."""
     return read_frames(model, images, temperature_degC)[:2]
 
 
 def outputs(network: Classifier, data: Labelled, valid: np.ndarray, looks: np.ndarray) -> ClassifierOutputs:
-    """The network's outputs on n frames, valid (n,) or not, with looks (n, measures): the head's features
-    with the appearance of the key areas beside them."""
+    """Returns the network's outputs on n frames, valid (n,) or not, with looks (n, measures). Features are
+    those of the head, joined with the appearance of the key areas."""
     prediction = predict(network, data.key_area, data.temperature_degC)
     return ClassifierOutputs(
         prediction.logits,
@@ -81,9 +82,9 @@ def outputs(network: Classifier, data: Labelled, valid: np.ndarray, looks: np.nd
 
 
 class WindowPredictions(NamedTuple):
-    """Of w windows: the flow seen and the probabilities of the classes that follow from it; the shares of
-    classes counted (w, 3); the truth at their middle frames, rows (w, length) of the frames, whether any is
-    valid (w,)."""
+    """For w windows: `seen`, flow and the class probabilities that follow from it; `hard` (w, 3), shares of
+    the counted classes; `truth` at their middle frames; `rows` (w, length) of the frames; `any_valid` (w,),
+    whether a frame is valid."""
 
     seen: WindowFlow
     hard: np.ndarray
@@ -97,7 +98,7 @@ class WindowPredictions(NamedTuple):
 
 
 def joined_windows(several: Sequence[WindowPredictions]) -> WindowPredictions:
-    """One behind the other."""
+    """Returns these windows, concatenated in order."""
     seen, hard, truth, rows, any_valid = zip(*several, strict=True)
     return WindowPredictions(
         WindowFlow(*map(np.concatenate, zip(*seen, strict=True))),
@@ -111,8 +112,8 @@ def joined_windows(several: Sequence[WindowPredictions]) -> WindowPredictions:
 def window_predictions(
     fitted: ClassifierCalibration, frames: ClassifierOutputs, *, length: int
 ) -> WindowPredictions:
-    """Predictions of the windows of `length` frames of one segment; 1/3 each for those without a valid
-    frame."""
+    """Returns the predictions of the windows with `length` frames of one segment; 1/3 for each class if no
+    frame is valid."""
     rows = calibration.windows(frames.segment, length=length)
     log_p, valid = calibration.log_probabilities(frames.logits, fitted.temperature)[rows], frames.valid[rows]
     looks, middle = medians(frames.looks, rows), rows[:, length // 2]
@@ -129,8 +130,8 @@ def window_predictions(
 def reliabilities(
     fitted: ClassifierCalibration, frames: ClassifierOutputs, windows: WindowPredictions
 ) -> dict[tuple[str, str], Reliability]:
-    """By (image or window, method): before and after calibration; of windows the paper's hard counts, and
-    what follows from the flow seen."""
+    """Returns reliabilities by (image or window, method). Images: before and after calibration. Windows: the
+    paper's hard counts, and the probabilities that follow from the flow seen."""
     v, some = frames.valid, windows.any_valid
     images = {
         "raw": scipy.special.softmax(frames.logits[v], axis=1),
@@ -147,8 +148,8 @@ def reliabilities(
 
 
 def foreign_images(key_area: np.ndarray) -> dict[str, np.ndarray]:
-    """Key areas (n, 16, 48) as no bead looks: a lens out of focus, little and
-    much, and a rectangle that lies across the line."""
+    """Returns key areas (n, 16, 48) as no bead looks: out of focus, slightly and strongly, and with the
+    rectangle lying across the line."""
     blurred = {
         name: np.stack([cv2.GaussianBlur(a, (0, 0), sigma) for a in key_area])
         for name, sigma in (("slight_blur", 1.5), ("blur", 2.5))
@@ -166,8 +167,8 @@ def foreign_images(key_area: np.ndarray) -> dict[str, np.ndarray]:
 def foreign_detection(
     model: CalibratedClassifier, frames: ClassifierOutputs, data: Labelled
 ) -> dict[str, Any]:
-    """By kind of foreign picture the AUROC of the distance and the share found; and the share of familiar
-    ones called foreign."""
+    """Returns, for each kind of foreign picture, the AUROC of the distance and the share detected; and the
+    share of familiar pictures called foreign."""
     v, fitted = frames.valid, model.calibration
     familiar = calibration.mahalanobis(fitted.familiar, frames.features[v])
     figures: dict[str, Any] = {"false_alarms": float(np.mean(familiar > fitted.foreign_above))}
@@ -184,9 +185,9 @@ def foreign_detection(
 
 
 def yardstick_classes(learned: Labelled, data: Labelled) -> dict[str, np.ndarray]:
-    """The classes (n,) of the frames `data` by a support vector machine on the profile and by the width, both
-    fitted on valid frames that the network learned."""
-    from pipeline.setpoint.vision import yardsticks  # here, as who only classifies needs none
+    """Returns the classes (n,) of the frames `data` by two references: a support vector machine on the
+    profile, and the width. Both are fitted to valid frames that the network learned."""
+    from pipeline.setpoint.vision import yardsticks  # imported here, since classifying does not need it
 
     machine = yardsticks.fit_profile_machine(
         learned.key_area, learned.temperature_degC, learned.label, learned.segment

@@ -1,7 +1,7 @@
-"""What a classifier's probabilities are worth: temperature for one image, the flow of a window, distance from
-what was learned, and whether it is proven on prints that nothing was learned from.
+"""Calibrates a classifier: its temperature for one image, the flow of a window, the distance from what was
+learned, and whether it is proven on prints that were not used to train it.
 
-All of it is fitted on segments that the classifier never saw, and judged on yet others.
+Everything is fitted on segments that the classifier never saw, and tested on further ones.
 """
 
 import itertools
@@ -27,12 +27,13 @@ CLASSES = 3
 
 
 def log_probabilities(logits: np.ndarray, temperature: float) -> np.ndarray:
-    """log softmax(logits / T) (n, 3): the higher T, the less sure (Guo, Pleiss, Sun, Weinberger 2017)."""
+    """Returns log softmax(logits / T) (n, 3). The higher T, the lower the confidence (Guo, Pleiss, Sun,
+    Weinberger 2017)."""
     return scipy.special.log_softmax(np.asarray(logits, float) / temperature, axis=1)
 
 
 def fit_temperature(logits: np.ndarray, label: np.ndarray) -> float:
-    """The T that makes the labels (n,) most likely, between 1/20 and 20."""
+    """Returns the T, between 1/20 and 20, that makes the labels (n,) most likely."""
     label = np.asarray(label)
     fit = scipy.optimize.minimize_scalar(
         lambda log_t: -log_probabilities(logits, np.exp(log_t))[np.arange(len(label)), label].mean(),
@@ -46,8 +47,8 @@ def fit_temperature(logits: np.ndarray, label: np.ndarray) -> float:
 
 
 def hard_shares(log_p: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """p_c = w_c / w, the shares of the valid frames' most likely classes (w, 3) (Li and Pattinson 2025, eq.
-    4; scaled: p / max p). No valid frame: 1/3 each."""
+    """Returns p_c = w_c / w (w, 3), the shares of the most likely classes of the valid frames (Li and
+    Pattinson 2025, eq. 4; the paper then scales by p / max p). Without a valid frame: 1/3 each."""
     named = np.where(valid, log_p.argmax(axis=2), -1)
     counts = (named[:, :, None] == np.arange(CLASSES)).sum(axis=1)
     m = valid.sum(axis=1)[:, None]
@@ -57,10 +58,10 @@ def hard_shares(log_p: np.ndarray, valid: np.ndarray) -> np.ndarray:
 def recorded(
     seen: WindowFlow, flow: np.ndarray, segment: np.ndarray, *, flow_edges: np.ndarray
 ) -> WindowTable:
-    """What was seen in w windows of segments (w,) printed at flow (w,) percent, as the simulator draws it
-    again; windows without a valid frame are left out.
+    """Returns w windows of segments (w,) printed at flow (w,) percent as a table from which the simulator
+    draws. Windows without a valid frame are left out.
 
-    flow_edges (bins + 1,) in percent; raises ValueError where a flow lies outside them.
+    `flow_edges`: (bins + 1,) in percent. Raises ValueError if a flow lies outside them.
     """
     flow, flow_edges = np.asarray(flow, float), np.asarray(flow_edges, float)
     outside = ~((flow >= flow_edges[0]) & (flow <= flow_edges[-1]))
@@ -81,9 +82,9 @@ def recorded(
 
 
 class Reliability(NamedTuple):
-    """By bin of the highest probability: mean confidence, share right (NaN where empty), count, lower edges;
-    `error` is the expected calibration error, and `floor` what a perfectly calibrated classifier with these
-    probabilities would show on as many."""
+    """For each bin of the highest probability: mean confidence, fraction correct (NaN if empty), count, lower
+    edge. `error`: expected calibration error; `floor`: the error that a perfectly calibrated classifier with
+    these probabilities would show on as many samples."""
 
     confidence: np.ndarray
     accuracy: np.ndarray
@@ -94,11 +95,13 @@ class Reliability(NamedTuple):
 
 
 def reliability(p: np.ndarray, label: np.ndarray, *, bins: int) -> Reliability:
-    """ECE = sum_b n_b / n |accuracy_b - confidence_b| over `bins` bins of equal width between 1/3 and 1,
-    where the highest of three probabilities lies (Guo et al. 2017).
+    """Returns the reliability of probabilities p (n, 3), in `bins` bins of equal width between 1/3 and 1, the
+    range of the highest of three probabilities (Guo et al. 2017):
 
-    p (n, 3). Were p true, a bin's hits would scatter by sqrt(sum c (1 - c)): the floor is
-    the mean of that, sqrt(2 / pi) of it, over all bins.
+        ECE = sum_b n_b / n |accuracy_b - confidence_b|
+
+    If p were exact, the number correct in a bin would scatter with deviation sqrt(sum c (1 - c)). Its mean
+    absolute value is sqrt(2 / pi) of that; the floor is the sum of these over all bins, divided by n.
     """
     p, label = np.asarray(p, float), np.asarray(label)
     edges = np.linspace(1 / CLASSES, 1.0, bins + 1)
@@ -118,12 +121,12 @@ def reliability(p: np.ndarray, label: np.ndarray, *, bins: int) -> Reliability:
 def share_by_segment(
     happened: np.ndarray, segment: np.ndarray, *, weight: np.ndarray | None = None, confidence: float = 0.95
 ) -> Share:
-    """The share of True among n images or windows, in percent, with its interval: what is of one segment (n,)
-    errs together, so the segments are what was drawn. Each counts by its weight (n,), of mean 1.
+    """Returns the percentage of True among n images or windows, with its interval. Images of one segment (n,)
+    err together, so segments are treated as the random sample. `weight` (n,), of mean 1, weighs each image.
 
-    Wilson's interval of n_eff = p (1 - p) / V images, with V the variance of a ratio of sums over segments
-    and a factor for Student's t of few of them (Korn and Graubard 1998); n_eff is at most n, and the number
-    of segments where all or none happened. No image: NaN.
+    It is Wilson's interval for n_eff = p (1 - p) / V images (Korn and Graubard 1998). V is the variance of a
+    ratio of sums over segments; a factor accounts for Student's t of few segments. n_eff is at most n; it is
+    the number of segments if all values are True or all False. Without images: NaN.
     """
     happened, n = np.asarray(happened, float), len(happened)
     if n == 0:
@@ -147,7 +150,7 @@ def share_by_segment(
 
 
 class WindowTruth(NamedTuple):
-    """Of w windows: true class (w,), flow in percent (w,), temperature in °C (w,) and segment (w,)."""
+    """Truth of w windows: class (w,), flow in percent (w,), temperature in °C (w,) and segment (w,)."""
 
     label: np.ndarray
     flow_percent: np.ndarray
@@ -160,8 +163,8 @@ JUDGED_PERCENT = tuple(np.arange(70.0, 151.0, 5.0))
 
 
 class FlowShare(NamedTuple):
-    """Of windows with a true flow from `flow_low` to `flow_high` percent: how many, and the share for which
-    something holds, in percent, with its 95 % interval by segment; NaN where there is none."""
+    """Windows with a true flow from `flow_low` to `flow_high` percent: their number, and the percentage of
+    True with its 95 % interval by segment; NaN without windows."""
 
     flow_low: float
     flow_high: float
@@ -172,7 +175,7 @@ class FlowShare(NamedTuple):
 
 
 def by_flow(happened: np.ndarray, truth: WindowTruth) -> list[FlowShare]:
-    """The share of True (w,) in each bin of JUDGED_PERCENT."""
+    """Returns the percentage of True (w,) in each bin of JUDGED_PERCENT."""
     rows = []
     for low, high in itertools.pairwise(JUDGED_PERCENT):
         here = (truth.flow_percent >= low) & (truth.flow_percent < high)
@@ -182,8 +185,9 @@ def by_flow(happened: np.ndarray, truth: WindowTruth) -> list[FlowShare]:
 
 
 def uniform_share(happened: np.ndarray, truth: WindowTruth) -> Share:
-    """The share of True (w,) as if the flows were uniform over JUDGED_PERCENT, in percent: the mean over its
-    bins, each with the variance of its share by segment. NaN where a bin has no window."""
+    """Returns the percentage of True (w,) as if the flows were uniform over JUDGED_PERCENT. It is the mean
+    over the bins; its interval follows from the variances of the bins' percentages by segment. NaN if a bin
+    has no window."""
     rows = by_flow(happened, truth)
     z = scipy.special.ndtri(0.975)
     mean = float(np.mean([row.percent for row in rows]))
@@ -195,19 +199,19 @@ def uniform_share(happened: np.ndarray, truth: WindowTruth) -> Share:
 
 
 class Familiar(NamedTuple):
-    """Means of the three classes' features (3, f) and the whitening
-    L^-1 (f, f) of their common covariance L L'."""
+    """Mean features of the three classes (3, f), and the whitening L^-1 (f, f) of their common covariance L
+    L'."""
 
     means: np.ndarray
     whitening: np.ndarray
 
 
 def fit_familiar(features: np.ndarray, label: np.ndarray) -> Familiar:
-    """Gaussians of one covariance round each class's features (n, f) (Lee, Lee, Lee and Shin 2018), the
-    covariance shrunk (Ledoit and Wolf 2004)."""
+    """Fits one Gaussian to each class's features (n, f), with a common covariance (Lee, Lee, Lee and Shin
+    2018) that is shrunk (Ledoit and Wolf 2004)."""
     features, label = np.asarray(features, float), np.asarray(label)
     means = np.array([features[label == c].mean(axis=0) for c in range(CLASSES)])
-    from sklearn.covariance import LedoitWolf  # here, as who only classifies fits none
+    from sklearn.covariance import LedoitWolf  # imported here, since classifying does not need it
 
     covariance = LedoitWolf(assume_centered=True).fit(features - means[label]).covariance_
     covariance += 1e-9 * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
@@ -222,11 +226,11 @@ BAND_ROWS, BAND_COLUMNS = (
 
 
 def appearance(key_area: np.ndarray) -> np.ndarray:
-    """log energy of key areas (n, 16, 48) in octaves of spatial frequency, across and along the bead (n, 34),
-    each area scaled to mean 0 and deviation 1.
+    """Returns the log energy of key areas (n, 16, 48) in octaves of spatial frequency, across and along the
+    bead (n, 34). Each area is first scaled to mean 0 and deviation 1.
 
-    A network trained for width is made blind to much else: its features hardly move under blur or a wrong
-    angle, which empty and fill these bands.
+    A network trained for width learns to ignore much else. Its features hardly change with blur or a wrong
+    angle, but the energy in these bands does.
     """
     x = np.asarray(key_area, np.float32)
     x = x - x.mean(axis=(1, 2), keepdims=True)
@@ -239,7 +243,7 @@ def appearance(key_area: np.ndarray) -> np.ndarray:
 
 
 def mahalanobis(familiar: Familiar, features: np.ndarray) -> np.ndarray:
-    """min_c (f - mu_c)' Sigma^-1 (f - mu_c) (n,): how foreign each image is."""
+    """Returns min_c (f - mu_c)' Sigma^-1 (f - mu_c) (n,): how unfamiliar each image is."""
     white = np.asarray(features, float) @ familiar.whitening.T
     return np.min(
         [((white - mean) ** 2).sum(axis=1) for mean in familiar.means @ familiar.whitening.T], axis=0
@@ -247,14 +251,14 @@ def mahalanobis(familiar: Familiar, features: np.ndarray) -> np.ndarray:
 
 
 def foreign_above(scores: np.ndarray, *, false_alarms: float) -> float:
-    """The score that a share `false_alarms` of familiar images exceeds at most."""
+    """Returns the score that at most a fraction `false_alarms` of familiar images exceeds."""
     scores = np.sort(np.asarray(scores, float))
     return float(scores[int(np.ceil((1 - false_alarms) * len(scores))) - 1])
 
 
 def auroc(familiar: np.ndarray, foreign: np.ndarray) -> float:
-    """The probability that a foreign score exceeds a familiar one,
-    ties for a half (Mann and Whitney 1947)."""
+    """Returns the probability that the score of a foreign image exceeds that of a familiar one. A tie counts
+    one half (Mann and Whitney 1947)."""
     return float(scipy.stats.mannwhitneyu(foreign, familiar).statistic / (len(familiar) * len(foreign)))
 
 
@@ -263,8 +267,8 @@ def auroc(familiar: np.ndarray, foreign: np.ndarray) -> float:
 
 class ClassifierOutputs(NamedTuple):
     """A network's outputs on n frames: logits (n, 3), features with appearance (n, f), log(flow / 100 %) (n,)
-    with its deviation (n,); and the frames' label, flow in percent, temperature in °C, segment and valid
-    (n,), and their looks (n, measures), NaN of frames that are not measured."""
+    and its standard deviation (n,). With the frames' label, flow in percent, temperature in °C, segment and
+    validity (n,), and their looks (n, measures), NaN for frames that were not measured."""
 
     logits: np.ndarray
     features: np.ndarray
@@ -282,8 +286,9 @@ class ClassifierOutputs(NamedTuple):
 
 
 class ClassifierCalibration(NamedTuple):
-    """What turns outputs into decisions: temperature of images, the distance that is foreign, what turns the
-    flows of frames into that of a window, and whether it may judge at all."""
+    """Turns outputs into decisions: `temperature` of single images; `familiar` and `foreign_above`, the
+    distance above which an image is foreign; `flow`, from the flows of frames to that of a window; `proof`,
+    whether the classifier may be used at all."""
 
     temperature: float
     familiar: Familiar
@@ -295,8 +300,9 @@ class ClassifierCalibration(NamedTuple):
 def calibrate(
     learned: ClassifierOutputs, unseen: ClassifierOutputs, *, length: int, false_alarms: float
 ) -> ClassifierCalibration:
-    """Everything fitted on segments `unseen` in training, but for the familiar features, which are those
-    `learned`; windows have `length` frames. Nothing is proven yet."""
+    """Fits everything on segments that were `unseen` in training, except the familiar features, which come
+    from `learned`. Windows have `length` frames. The result is not yet proven. Raises ValueError if no
+    segment has `length` frames."""
     v = unseen.valid
     T = fit_temperature(unseen.logits[v], unseen.label[v])
     rows = windows(unseen.segment, length=length)
@@ -317,7 +323,8 @@ def calibrate(
 def prove(
     named: np.ndarray, truth: WindowTruth, *, least: float, known_from: int, rendered: bool
 ) -> CameraProof:
-    """What the classes named (w,) of windows of segments or prints that nothing was learned from prove."""
+    """Returns what the classes named (w,) prove about the classifier; the windows' segments or prints were
+    not used to train it."""
     n, of_class = len(named), np.bincount(truth.label, minlength=CLASSES)
     weight = n / CLASSES / of_class[truth.label]
     share = share_by_segment(

@@ -1,5 +1,5 @@
-"""Key areas -> flow class: split by segment, augmentation, training with checkpoints (Li and Pattinson 2025,
-sections 2.2 and 3.2), prediction."""
+"""Classifies the flow from key areas: split by segment, augmentation, training with checkpoints (Li and
+Pattinson 2025, sections 2.2 and 3.2), prediction."""
 
 import functools
 from collections.abc import Callable
@@ -17,8 +17,8 @@ CLASS_NAMES = ("under (flow < 90 %)", "good (90 to 110 %)", "over (flow > 110 %)
 
 
 class Labelled(NamedTuple):
-    """Key areas (n, 16, 48) uint8 with nozzle temperature in °C (n,), class 0, 1, 2 (n,), flow in percent of
-    nominal (n,), and the segment or print that each was filmed in (n,)."""
+    """Key areas (n, 16, 48) uint8, each with its nozzle temperature in °C (n,), class 0, 1 or 2 (n,), flow in
+    percent of nominal (n,), and the segment or print in which it was filmed (n,)."""
 
     key_area: np.ndarray
     temperature_degC: np.ndarray
@@ -31,8 +31,8 @@ class Labelled(NamedTuple):
 
 
 def checked(data: Labelled) -> Labelled:
-    """`data` as arrays; raises ValueError where shapes, depth, labels, flows or temperatures are none that a
-    classifier can learn from, or a class is empty."""
+    """Returns `data` as arrays. Raises ValueError if shapes, pixel depth, labels, flows or temperatures are
+    unusable for training, or if a class is empty."""
     data = Labelled(*(np.asarray(a) for a in data))
     n = len(data.label)
     if data.key_area.shape != (n, ROWS, COLUMNS) or data.key_area.dtype != np.uint8:
@@ -73,12 +73,12 @@ def checked(data: Labelled) -> Labelled:
 def split_by_segment(
     data: Labelled, *, shares: tuple[float, ...], rng: np.random.Generator
 ) -> list[np.ndarray]:
-    """Rows of each part, no segment in two of them, every class near its share: segments come in random
-    order, each to the part that lacks its classes most.
+    """Returns the rows of each part. No segment is in two parts, and every class is near its share: segments
+    come in random order, and each goes to the part that lacks its classes most.
 
-    Images of one segment look alike: a split by image would test what was learned by heart. A print with
-    several classes in it counts for each (the idea is that of iterative stratification; Sechidis, Tsoumakas
-    and Vlahavas 2011). Raises ValueError where the segments do not suffice.
+    Images of one segment look alike, so a split by image would test memory. A print with several classes
+    counts for each of them (the idea is iterative stratification; Sechidis, Tsoumakas and Vlahavas 2011).
+    Raises ValueError if there are too few segments.
     """
     data = checked(data)
     names, index = np.unique(data.segment, return_inverse=True)
@@ -110,15 +110,16 @@ def split_by_segment(
 
 
 def _resample(x: Array, start: Array, keep: Array) -> Array:
-    """The last axis (of k) read at start + keep k by linear
-    interpolation; start in px and keep of 1 are (n,)."""
+    """Reads the last axis (index k) at start + keep k by linear interpolation. `start` (n,) in px; `keep`
+    (n,) as a fraction of 1."""
     k = jnp.arange(x.shape[-1])
     at = start[:, None] + keep[:, None] * (k + 0.5) - 0.5
     return jnp.einsum("nrk,nkj->nrj", x, jax.nn.relu(1 - jnp.abs(at[:, None, :] - k[:, None])))
 
 
 def _crop(key: Array, x: Array) -> Array:
-    """10 to 30 % of the last axis cut off at random ends, the rest stretched to the old length."""
+    """Cuts 10 to 30 % off the last axis, divided at random between both ends, and stretches the rest to the
+    old length."""
     do, share, where = jax.random.split(key, 3)
     cut = jax.random.bernoulli(do, 0.5, (len(x),)) * jax.random.uniform(
         share, (len(x),), minval=0.1, maxval=0.3
@@ -131,7 +132,7 @@ def _flip(key: Array, x: Array, axis: int) -> Array:
 
 
 def _light(key: Array, x: Array) -> Array:
-    """Brightness and contrast +-10 %."""
+    """Changes brightness and contrast by up to +-10 %."""
     do, size = jax.random.split(key)
     change = jax.random.bernoulli(do, 0.5, (2, len(x), 1, 1)) * jax.random.uniform(
         size, (2, len(x), 1, 1), minval=-0.1, maxval=0.1
@@ -141,16 +142,16 @@ def _light(key: Array, x: Array) -> Array:
 
 
 def adr(key: Array, x: Float[Array, "n 16 48"]) -> Float[Array, "n 16 48"]:
-    """As published: crop 10-30 % of both sides, flip, brightness and contrast (Li and Pattinson 2025, section
-    2.2.1). The crop widens the bead, which is what is labelled."""
+    """The published augmentation: crop 10-30 % in both directions, flip, brightness and contrast (Li and
+    Pattinson 2025, section 2.2.1). Its crop widens the bead, although the label depends on the width."""
     across, along, flip, light = jax.random.split(key, 4)
     x = _crop(across, x.swapaxes(1, 2)).swapaxes(1, 2)
     return _light(light, _flip(flip, _crop(along, x), 2))
 
 
 def along_bead(key: Array, x: Float[Array, "n 16 48"]) -> Float[Array, "n 16 48"]:
-    """The form that keeps the width: the crop is along the bead only,
-    and either side of the bead may come first."""
+    """The augmentation that keeps the bead's width: it crops along the bead only, and may also swap the two
+    sides of the bead."""
     along, flip, mirror, light = jax.random.split(key, 4)
     return _light(light, _flip(mirror, _flip(flip, _crop(along, x), 2), 1))
 
@@ -158,16 +159,15 @@ def along_bead(key: Array, x: Float[Array, "n 16 48"]) -> Float[Array, "n 16 48"
 # ---- training
 
 
-AT_ONCE = 512  # images looked at together: what the paper's size holds of them then stays below 1 GB
-AT_ONCE_ON_CPU = 16  # images predicted together: what a CPU's caches hold, and little of it padded
+AT_ONCE = 512  # images processed together, so that a network of the paper's size needs less than 1 GB
+AT_ONCE_ON_CPU = 16  # images predicted together: they fit a CPU's caches, and little is padded
 ADAM = optax.scale_by_adam()  # Kingma and Ba 2015, its own beta 0.9 and 0.999
 
 
 class TrainState(NamedTuple):
-    """All that training needs to go on: epochs done, network, the running average of its weights, the
-    optimiser's state, the best average so far and its epoch, and the learning curve:
-    history (epochs, 3) holds training loss, held-out loss and held-out accuracy of each epoch done, NaN
-    after."""
+    """Everything needed to continue training: epochs done; network; running average of its weights; optimiser
+    state; best average so far and its epoch; learning curve `history` (epochs, 3) with training loss,
+    held-out loss and held-out accuracy of each epoch done, NaN after that."""
 
     epoch: Array
     network: Classifier
@@ -179,8 +179,8 @@ class TrainState(NamedTuple):
 
 
 def untrained(network: Classifier, *, epochs: int) -> TrainState:
-    """The state before the first of at most `epochs` epochs; a
-    checkpoint is put into one by from_named_arrays."""
+    """Returns the state before the first of at most `epochs` epochs. from_named_arrays loads a checkpoint
+    into it."""
     return TrainState(
         jnp.array(0),
         network,
@@ -193,9 +193,9 @@ def untrained(network: Classifier, *, epochs: int) -> TrainState:
 
 
 class TrainingSettings(NamedTuple):
-    """How a network is trained by AdamW. The learning rate rises over warmup_epochs to learning_rate and
-    falls by a cosine of half period cycle_epochs. `averaging` is the decay a step of the running average of
-    the weights, which is what is judged and kept (0: the weights themselves). Training ends after `patience`
+    """Settings of the training by AdamW. The learning rate rises over `warmup_epochs` to `learning_rate` and
+    then falls by a cosine with half period `cycle_epochs`. `averaging`: decay per step of the running average
+    of the weights, which is tested and kept (0: the weights themselves). Training ends after `patience`
     epochs without a better held-out loss."""
 
     cycle_epochs: int
@@ -209,8 +209,8 @@ class TrainingSettings(NamedTuple):
 
 
 class Rates(NamedTuple):
-    """Highest learning rate, steps of its linear rise and of half its cosine; weight decay, label smoothing,
-    decay a step of the weights' running average."""
+    """`highest`: largest learning rate; `rise`: steps of its linear rise; `cycle`: steps of half its cosine;
+    `weight_decay`; `smoothing` of labels; `averaging`: decay per step of the weights' running average."""
 
     highest: float
     rise: float
@@ -221,8 +221,9 @@ class Rates(NamedTuple):
 
 
 def cosine(step: Array, rates: Rates) -> Array:
-    """Cosine annealing highest (1 + cos(pi t / cycle)) / 2 (Loshchilov and Hutter 2017; the paper's cycle is
-    100 epochs from 1e-4), after a linear rise."""
+    """Returns the learning rate of a step: cosine annealing highest (1 + cos(pi t / cycle)) / 2 (Loshchilov
+    and Hutter 2017; the paper's cycle is 100 epochs from 1e-4), times a linear rise over the first `rise`
+    steps."""
     return (
         rates.highest
         * jnp.minimum(1.0, (step + 1) / jnp.maximum(rates.rise, 1))
@@ -232,14 +233,14 @@ def cosine(step: Array, rates: Rates) -> Array:
 
 
 def cross_entropy(logits: Float[Array, "n 3"], label: Array, smoothing: float) -> Array:
-    """Mean of -sum_c t_c log p_c with targets t = (1 - smoothing) one-hot + smoothing / 3."""
+    """Returns the mean of -sum_c t_c log p_c with targets t = (1 - smoothing) one-hot + smoothing / 3."""
     target = (1 - smoothing) * jax.nn.one_hot(label, CLASSES) + smoothing / CLASSES
     return -jnp.mean(jnp.sum(target * jax.nn.log_softmax(logits), axis=1))
 
 
 def flow_loss(log_flow: Array, log_deviation: Array, flow_percent: Array) -> Array:
-    """Mean of log s + ((y - mu) / s)^2 / 2 with y = log(flow / 100 %): the negative log likelihood of
-    Normal(mu, s), but for its constant (Nix and Weigend 1994)."""
+    """Returns the mean of log s + ((y - mu) / s)^2 / 2 with y = log(flow / 100 %): the negative log
+    likelihood of Normal(mu, s) without its constant (Nix and Weigend 1994)."""
     error = jnp.log(flow_percent / 100) - log_flow
     return jnp.mean(log_deviation + 0.5 * (error * jnp.exp(-log_deviation)) ** 2)
 
@@ -247,7 +248,7 @@ def flow_loss(log_flow: Array, log_deviation: Array, flow_percent: Array) -> Arr
 def total_loss(
     outputs: tuple[Array, Array, Array], label: Array, flow_percent: Array, smoothing: float
 ) -> Array:
-    """Cross entropy of the classes and flow_loss, added: the logarithm of what is said of both."""
+    """Returns the cross entropy of the classes plus flow_loss: the negative log likelihood of both."""
     logits, *flow = outputs
     return cross_entropy(logits, label, smoothing) + flow_loss(*flow, flow_percent)
 
@@ -262,11 +263,12 @@ def train(
     augment: Callable[[Array, Array], Array],
     on_step: Callable[[TrainState], None] = lambda state: None,
 ) -> TrainState:
-    """Trains on `learned` until the loss on `held_out` has not improved for settings.patience epochs; `best`
-    of the state returned is the classifier.
+    """Trains on `learned` until the loss on `held_out` has not improved for settings.patience epochs. `best`
+    of the returned state is the classifier.
 
-    After each epoch on_step gets the state: what a checkpoint holds. All randomness is that of (key, epoch),
-    so that training from any of these states ends at the very same weights.
+    Calls on_step(state) after each epoch; a checkpoint is such a state. All randomness comes from (key,
+    epoch), so training continued from any of these states ends with identical weights. Raises ValueError for
+    data that `checked` refuses, for a segment in both sets, or if no held-out loss is a number.
     """
     learned, held_out = checked(learned), checked(held_out)
     _check_apart(learned, held_out)
@@ -313,7 +315,7 @@ def _on_device(values: np.ndarray) -> Array:
 
 
 def _check_apart(learned: Labelled, held_out: Labelled) -> None:
-    """Raises ValueError where a segment is in both."""
+    """Raises ValueError if a segment is in both sets."""
     shared = np.intersect1d(learned.segment, held_out.segment)
     if len(shared):
         raise ValueError(
@@ -324,8 +326,12 @@ def _check_apart(learned: Labelled, held_out: Labelled) -> None:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _step(augment, carry, drawn: tuple[Array, Array], rows: list[Array], rates: Rates):
-    """One batch, drawn as (key, rows): AdamW (Loshchilov and Hutter 2019), theta <- theta - rate (Adam's
-    direction + decay theta), and the running average of theta."""
+    """Trains on one batch, `drawn` = (key, rows), with AdamW (Loshchilov and Hutter 2019),
+
+        theta <- theta - rate (Adam's direction + decay theta)
+
+    and updates the running average of theta.
+    """
     (network, average, opt_state), (key, chosen) = carry, drawn
     key_area, temperature, label, flow = [a[chosen] for a in rows]
     augmented = augment(key, key_area.astype(jnp.float32))
@@ -336,18 +342,19 @@ def _step(augment, carry, drawn: tuple[Array, Array], rows: list[Array], rates: 
     direction, opt_state = ADAM.update(gradient, opt_state)
     rate = cosine(t, rates)
     network = jax.tree.map(lambda w, d: w - rate * (d + rates.weight_decay * w), network, direction)
-    keep = jnp.minimum(rates.averaging, (1 + t) / (10 + t))  # the first steps are forgotten sooner
+    keep = jnp.minimum(rates.averaging, (1 + t) / (10 + t))  # forgets the first steps sooner
     return (network, jax.tree.map(lambda a, w: keep * a + (1 - keep) * w, average, network), opt_state), loss
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _steps(augment, carry, drawn, rows, rates):
-    """A whole epoch as one program, for a device that should not wait for Python."""
+    """Runs a whole epoch as one program, for a device that should not wait for Python."""
     return jax.lax.scan(lambda carry, one: _step(augment, carry, one, rows, rates), carry, drawn)
 
 
 def _steps_on_cpu(augment, carry, drawn, rows, rates):
-    """The same, one call a step: a scan would be another program, with other last digits."""
+    """Does the same with one call for each step. A scan would be another program and would round
+    differently."""
     losses = []
     for one in zip(*drawn, strict=True):
         carry, loss = _step(augment, carry, one, rows, rates)
@@ -362,13 +369,13 @@ def _outputs(network: Classifier, key_area: Array, temperature_degC: Array) -> t
 
 @jax.jit
 def _judged(state: TrainState, loss: Array, outputs: tuple, truth: list[Array]) -> TrainState:
-    """The state with its average judged by its outputs for the held-out segments, of which `truth` holds
-    class and flow, and kept where its loss is the lowest yet."""
+    """Returns the state after an epoch. Tests its average by its outputs on the held-out segments, whose
+    class and flow are `truth`, and keeps it as `best` if its loss is the lowest so far."""
     right = jnp.argmax(outputs[0], axis=1) == truth[0]
     row = jnp.stack([loss.mean(), total_loss(outputs, *truth, 0.0), jnp.mean(right)])
     better = row[1] < jnp.min(
         jnp.nan_to_num(state.history[:, 1], nan=jnp.inf)
-    )  # never where the loss is no number
+    )  # never if the loss is not a number
     best = jax.tree.map(lambda new, old: jnp.where(better, new, old), state.average, state.best)
     history = state.history.at[state.epoch].set(row)
     return state._replace(
@@ -383,8 +390,8 @@ def _judged(state: TrainState, loss: Array, outputs: tuple, truth: list[Array]) 
 
 
 class ClassifierPrediction(NamedTuple):
-    """Logits (n, 3), the features that the last layers saw (n, f), log(flow / 100 %) (n,) and its deviation
-    (n,), all float32."""
+    """Logits (n, 3); the features that enter the last layers (n, f); log(flow / 100 %) (n,) and its standard
+    deviation (n,). All float32."""
 
     logits: np.ndarray
     features: np.ndarray
@@ -403,10 +410,10 @@ def _predict(network: Classifier, key_area: Array, temperature_degC: Array) -> t
 def predict(
     network: Classifier, key_area: np.ndarray, temperature_degC: np.ndarray, *, batch: int | None = None
 ) -> ClassifierPrediction:
-    """Logits, features and flow of key areas (n, 16, 48) at temperatures (n,), from the mean features of each
-    area's four mirror images: a bead has no left, right, head or tail.
+    """Returns logits, features and flow of key areas (n, 16, 48) at temperatures (n,) in °C. Features are
+    averaged over each area's four mirror images, because a bead has no left, right, head or tail.
 
-    It takes batches, the last one padded, so that one program serves any n: on a CPU of AT_ONCE_ON_CPU.
+    Works in batches (on a CPU of AT_ONCE_ON_CPU) and pads the last one, so that one program serves any n.
     """
     batch = batch or (AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE)
     key_area, temperature_degC = (

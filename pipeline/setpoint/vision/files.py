@@ -1,4 +1,5 @@
-"""What train_classifier leaves: the classifier with its calibration, to two files and back."""
+"""Stores the results of train_classifier, the classifier with its calibration, in two files, and restores
+them."""
 
 import contextlib
 from collections.abc import Callable
@@ -30,7 +31,7 @@ CLASSIFIER_SCHEMA, CALIBRATION = "classifier 2", ("classifier_calibration", 3)
 
 
 def store_classifier(folder: Path, size: str, model: CalibratedClassifier) -> None:
-    """weights.safetensors, and calibration.parquet with all that was fitted after training."""
+    """Writes weights.safetensors, and calibration.parquet with everything that was fitted after training."""
     write_weights(
         folder / "weights.safetensors", CLASSIFIER_SCHEMA, named_arrays(model.network), {"size": size}
     )
@@ -64,7 +65,8 @@ def store_classifier(folder: Path, size: str, model: CalibratedClassifier) -> No
 
 
 def restore_network(weights_path: str) -> tuple[Classifier, str]:
-    """The network that `store_classifier` wrote, and its size."""
+    """Returns the network that `store_classifier` wrote, and its size. Raises ValueError if the file has no
+    known size."""
     arrays, about = read_weights(weights_path, CLASSIFIER_SCHEMA)
     if about.get("size") not in SIZES:
         raise ValueError(
@@ -79,7 +81,7 @@ def restore_network(weights_path: str) -> tuple[Classifier, str]:
 
 
 def restore_classifier(weights_path: str, calibration_path: str) -> CalibratedClassifier:
-    """What `store_classifier` wrote."""
+    """Returns the classifier that `store_classifier` wrote."""
     network, _ = restore_network(weights_path)
     knots, measures = (len(KNOTS_PERCENT),), (len(NAMES),)
     shapes = {"flow_shown": knots, "flow_scale": knots}
@@ -105,8 +107,9 @@ def restore_classifier(weights_path: str, calibration_path: str) -> CalibratedCl
 
 
 def train_from_checkpoint(train: Callable, state: TrainState, checkpoint: Path) -> TrainState:
-    """train(state, on_step=...) from the checkpoint, if there is one; it is written after each epoch."""
-    with contextlib.suppress(ValueError):  # there is none yet, or it is damaged: from the beginning
+    """Returns train(state, on_step=...), continued from the checkpoint if there is one. Writes the checkpoint
+    after each epoch."""
+    with contextlib.suppress(ValueError):  # no checkpoint, or a damaged one: start from the beginning
         state = from_named_arrays(state, read_weights(checkpoint, CLASSIFIER_SCHEMA)[0])
     done, words = int(state.epoch), "train_classifier"
     with tqdm(total=len(state.history), initial=done, desc=words, unit="epoch", mininterval=2) as bar:

@@ -1,6 +1,6 @@
-"""A few frames for the page, with their key areas drawn in: rendered ones; or real ones if the classifier
-learned from recordings: some that it named rightly, the worst that it named wrongly, some that were rejected
-or are foreign, with the share of each and the reason."""
+"""A few frames for the report page, with their key areas drawn in. They are rendered ones, or real ones if
+the classifier learned from recordings: some classified correctly, the worst misclassified, some rejected or
+foreign, with the share of each group and the reason."""
 
 import collections
 import itertools
@@ -25,7 +25,7 @@ FURTHER = "foreign: further from what was learned than allowed"
 
 
 class Groups(NamedTuple):
-    """What was made of n frames: group (n) of the four; probabilities (n, 3), NaN where rejected; distance
+    """Results for n frames: `group` (n), one of the four; probabilities (n, 3), NaN if rejected; `distance`
     (n,) from what was learned."""
 
     group: np.ndarray
@@ -34,7 +34,7 @@ class Groups(NamedTuple):
 
 
 def classified_frames(model: CalibratedClassifier, frames: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Probabilities (n, 3) and distance (n,) of n frames, NaN of those that are not valid."""
+    """Returns probabilities (n, 3) and distance (n,) of n frames; NaN for frames that are not valid."""
     prob, distance = np.full((len(frames.valid), 3), np.nan), np.full(len(frames.valid), np.nan)
     some = np.flatnonzero(frames.valid)
     if len(some):
@@ -45,7 +45,7 @@ def classified_frames(model: CalibratedClassifier, frames: Any) -> tuple[np.ndar
 
 
 def group_frames(prob: np.ndarray, distance: np.ndarray, foreign_above: float, frames: Any) -> Groups:
-    """Each frame in one group: rejected by the front end, foreign to the classifier, named wrongly, or
+    """Puts each frame in one group: rejected by the front end, foreign to the classifier, misclassified, or
     accepted."""
     named = np.where(frames.valid, np.nan_to_num(prob).argmax(axis=1), -1)
     group = np.where(named == frames.label, ACCEPTED, WRONG)
@@ -54,8 +54,9 @@ def group_frames(prob: np.ndarray, distance: np.ndarray, foreign_above: float, f
 
 
 def choose_frames(groups: Groups, frames: Any) -> list[int]:
-    """Rows of the frames for the page: accepted ones of each class in turn, the wrong ones that were surest
-    first, rejected ones of each reason in turn, the commonest first, foreign ones furthest first."""
+    """Returns the rows of the frames for the page: accepted ones of each class in turn; misclassified ones,
+    the most confident first; rejected ones of each reason in turn, the commonest first; foreign ones, the
+    furthest first."""
     sure = np.nan_to_num(groups.prob).max(axis=1)
     kinds = [reason.partition(":")[0] for reason in frames.reasons]
     order = [kind for kind, _ in collections.Counter(k for k in kinds if k).most_common()]
@@ -63,7 +64,7 @@ def choose_frames(groups: Groups, frames: Any) -> list[int]:
     def of(group: str) -> np.ndarray:
         return np.flatnonzero(groups.group == group)
 
-    # of those at which a line was looked for: the others have no picture, or no tip
+    # only frames that were searched for a line: the others have no picture, or no tip
     accepted, rejected = of(ACCEPTED), np.flatnonzero((groups.group == REJECTED) & np.isfinite(frames.score))
     by_class = [_spread(accepted[frames.label[accepted] == c]) for c in range(3)]
     by_reason = [_spread(np.array([i for i in rejected if kinds[i] == kind], int)) for kind in order]
@@ -77,12 +78,12 @@ def choose_frames(groups: Groups, frames: Any) -> list[int]:
 
 
 def _spread(rows: np.ndarray) -> list[int]:
-    """At most MOST of the rows, evenly spread."""
+    """Returns at most MOST of the rows, evenly spread."""
     return rows[np.linspace(0, len(rows) - 1, min(MOST, len(rows))).round().astype(int)].tolist()
 
 
 def _in_turn(lists: Sequence[list[int]]) -> list[int]:
-    """The first of each list, then the second of each, MOST in all."""
+    """Returns the first of each list, then the second of each, MOST in all."""
     turns = itertools.chain.from_iterable(itertools.zip_longest(*lists))
     return [row for row in turns if row is not None][:MOST]
 
@@ -95,8 +96,8 @@ def describe_recorded(
     judged: np.ndarray,
     material: PrintedMaterial,
 ) -> dict[str, Any]:
-    """The row of frame i: what became of it, the share of the `judged` frames (n,) of which it is one, and
-    what was made of it."""
+    """Returns the row of frame i: its group, the group's share among the `judged` frames (n,), and its
+    results."""
     group, valid = str(groups.group[i]), bool(frames.valid[i])
     numbers = {
         "score": frames.score[i], "direction_deg": frames.angle_deg[i],
@@ -119,7 +120,7 @@ def describe_recorded(
 
 
 def draw_recorded(picture: np.ndarray, frames: Any, i: int) -> np.ndarray:
-    """The crop with the key area of frame i."""
+    """Draws the crop with the key area of frame i."""
     figures = (getattr(frames, name)[i] for name in ("angle_deg", "miss_px", "score", "padded_share"))
     area = key_area.KeyArea(frames.images[i], *map(float, figures), frames.reasons[i])
     return key_area.drawn(picture, (float(frames.tip[i, 0]), float(frames.tip[i, 1])), area)
@@ -131,8 +132,9 @@ def draw_recorded(picture: np.ndarray, frames: Any, i: int) -> np.ndarray:
 def render_examples(
     model: CalibratedClassifier, rng: np.random.Generator, *, least_score: float
 ) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
-    """(picture, row) of rendered frames with their key areas drawn in: two of each class, the first rejected
-    ones and a blurred one; a row has the truth, what was named, score, and why it was rejected."""
+    """Yields (picture, row) of rendered frames with their key areas drawn in: two of each class, the first
+    three rejected ones, and a blurred one. A row has the truth, the predicted class, the score, and the
+    reason of rejection."""
     wanted = {"under": 2, "good": 2, "over": 2, "rejected": 3}
     for i in range(200):
         if not any(wanted.values()):

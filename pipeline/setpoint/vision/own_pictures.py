@@ -1,11 +1,11 @@
-"""A classifier of few own pictures: the features of the shipped network stay as they are, and heads are
-fitted to them by ridge regression (Hoerl and Kennard 1970)
+"""A classifier from a few pictures of the user's own. The features of the shipped network are kept, and new
+heads are fitted to them by ridge regression (Hoerl and Kennard 1970)
 
-    W = (Z'Z + penalty I)^-1 Z' (y - mean y)    Z: features less their mean, in deviations
+    W = (Z'Z + penalty I)^-1 Z' (y - mean y)    Z: features minus their mean, in standard deviations
 
-of the three classes as 0 and 1, and of log(flow / 100 %). Every print is read by heads, and its windows by a
-calibration, that learned nothing from it. By their errors the spread is stretched: few prints teach a
-calibration what their own windows err by, not what those of the next print do.
+for the three classes as 0 and 1, and for log(flow / 100 %). Each print is predicted by heads, and its windows
+by a calibration, that did not learn from it. The spread is then enlarged by their errors: with few prints, a
+calibration learns the errors of its own windows, but not those of the next print.
 """
 
 from typing import NamedTuple
@@ -24,18 +24,19 @@ from pipeline.setpoint.vision.parts import all_frames
 from pipeline.setpoint.vision.vision_transformer import LOG_DEVIATION, Classifier
 from pipeline.setpoint.vision.window_flow import FlowCalibration, WindowFlow, class_probabilities
 
-# from so many stretches of constant settings on the network itself is trained
+# with at least this many stretches of constant settings the network itself is trained
 TRAINED_FROM = 2000
 PENALTY = 10.0
-# prints are left out one at a time, many of them in so many groups; each class is in so many prints at least,
-# as two are left out at a time
+# prints are left out one at a time, many prints in this many groups; each class must be in at least this many
+# prints, because two are left out at a time
 MOST_GROUPS, LEAST_PRINTS = 12, 3
-# share of the windows by whose errors the spread is stretched
+# fraction of the windows whose errors determine how much the spread is enlarged
 COVERED = 0.8
 
 
 class Heads(NamedTuple):
-    """Scores of the classes and log flow = features W + b, W (f, 4), b (4,); deviation of log flow."""
+    """Scores of the classes and log flow: features W + b, with W (f, 4) and b (4,). `deviation`: of log
+    flow."""
 
     W: np.ndarray
     b: np.ndarray
@@ -43,8 +44,8 @@ class Heads(NamedTuple):
 
 
 class OwnClassifier(NamedTuple):
-    """The classifier that learned from all prints; what heads that had not learned from a print say of its
-    frames and windows; and how far its frames are from those of the other prints (n,)."""
+    """`model`: the classifier trained on all prints. `frames` and `windows`: outputs of heads that had not
+    learned from the same print. `distance` (n,): of its frames from those of the other prints."""
 
     model: CalibratedClassifier
     frames: ClassifierOutputs
@@ -53,8 +54,8 @@ class OwnClassifier(NamedTuple):
 
 
 def learn(network: Classifier, frames: LabelledFrames, *, window: int, false_alarms: float) -> OwnClassifier:
-    """The shipped network with heads for the frames of a folder. Raises ValueError if a class is in too few
-    prints, or no print fills a window."""
+    """Returns the shipped network with heads for the frames of a folder. Raises ValueError if a class is in
+    too few prints, or if no print has enough frames for a window."""
     check(frames)
     data = all_frames(frames, recorded=True)
     outputs = calibrated_classifier.outputs(network, data, frames.valid, frames.surroundings)
@@ -79,8 +80,9 @@ def learn(network: Classifier, frames: LabelledFrames, *, window: int, false_ala
 
 
 def spread_growth(windows: WindowPredictions) -> float:
-    """By how much the spread must grow so that the share COVERED of windows that nothing was learned from err
-    by as little as Gaussian ones would: one print that is read quite wrongly shall not widen all others."""
+    """Returns the factor on the spread with which a share COVERED of the windows has errors no larger than
+    Gaussian ones would be; these windows were not learned from. It uses a quantile, so that one print that is
+    read quite wrongly does not widen all others."""
     some = windows.any_valid
     error = np.log(windows.seen.flow_seen[some] / windows.truth.flow_percent[some])
     within = np.quantile(np.abs(error) / windows.seen.spread[some], COVERED)
@@ -88,14 +90,14 @@ def spread_growth(windows: WindowPredictions) -> float:
 
 
 def stretch(flow: FlowCalibration, by: float) -> FlowCalibration:
-    """The calibration with a spread `by` times as large."""
+    """Returns the calibration with a spread `by` times as large."""
     return flow._replace(
         scale=by * flow.scale, looks=flow.looks._replace(explained=by * flow.looks.explained)
     )
 
 
 def widen(seen: WindowFlow, by: float) -> WindowFlow:
-    """The same flows with a spread `by` times as large, and the probabilities of the classes that follow."""
+    """Returns the same flows with a spread `by` times as large, and the class probabilities that follow."""
     some, prob = np.isfinite(seen.flow_seen), seen.prob.copy()
     prob[some] = class_probabilities(np.log(seen.flow_seen[some] / 100), by * seen.spread[some])
     return WindowFlow(seen.flow_seen, by * seen.spread, prob)
@@ -113,7 +115,7 @@ def check(frames: LabelledFrames) -> None:
 
 
 def fit_heads(learned: ClassifierOutputs) -> Heads:
-    """Heads by the features of valid frames."""
+    """Fits heads to the features of valid frames."""
     X = _features(learned)
     Y = np.column_stack([np.eye(calibration.CLASSES)[learned.label], np.log(learned.flow_percent / 100)])
     mean, deviation = X.mean(axis=0), X.std(axis=0) + 1e-6
@@ -125,19 +127,19 @@ def fit_heads(learned: ClassifierOutputs) -> Heads:
 
 
 def _features(outputs: ClassifierOutputs) -> np.ndarray:
-    """The features that the network's last layers see, without the appearance beside them."""
+    """Returns the features that the network's last layers see, without the appearance stored beside them."""
     return outputs.features[:, : -calibration.appearance(np.zeros((1, 16, 48))).shape[1]]
 
 
 def read(heads: Heads, outputs: ClassifierOutputs) -> ClassifierOutputs:
-    """What heads say of frames."""
+    """Returns the outputs of these heads for frames."""
     said = _features(outputs) @ heads.W + heads.b
     deviation = np.full(len(said), heads.deviation)
     return outputs._replace(logits=said[:, :-1], log_flow=said[:, -1], deviation=deviation)
 
 
 def read_apart(outputs: ClassifierOutputs, group: np.ndarray) -> ClassifierOutputs:
-    """What heads say of the frames (n,) of each group that learned from all others."""
+    """Returns outputs for all frames (n,). The heads for each group learned from all other groups."""
     rows, pieces = [], []
     for one in np.unique(group):
         mine = group == one
@@ -149,7 +151,7 @@ def read_apart(outputs: ClassifierOutputs, group: np.ndarray) -> ClassifierOutpu
 
 
 def _distances(outputs: ClassifierOutputs, group: np.ndarray) -> np.ndarray:
-    """(n,) how far each frame is from those of the other groups."""
+    """Returns the distance (n,) of each frame from the frames of the other groups."""
     distance = np.zeros(len(group))
     for one in np.unique(group):
         others = outputs.take(outputs.valid & (group != one))
@@ -159,7 +161,7 @@ def _distances(outputs: ClassifierOutputs, group: np.ndarray) -> np.ndarray:
 
 
 def with_heads(network: Classifier, heads: Heads) -> Classifier:
-    """The network with these heads in the place of its own."""
+    """Returns the network with these heads in place of its own."""
     middle, reach = LOG_DEVIATION
     z = np.arctanh((np.log(heads.deviation) - middle) / reach)
     flow_W = np.column_stack([heads.W[:, -1], np.zeros(len(heads.W))])

@@ -1,5 +1,5 @@
-"""In which parts frames are learned from, watched, calibrated and judged on, and which windows stand for the
-camera: parts share no segment, or no print."""
+"""Splits frames into parts for learning, early stopping, calibration and testing. Parts share no segment, or
+no print."""
 
 import collections
 from collections.abc import Mapping
@@ -11,12 +11,13 @@ from pipeline.setpoint.frames.rendered import LabelledFrames
 from pipeline.setpoint.vision import calibration
 from pipeline.setpoint.vision.classifier import CLASS_NAMES, Labelled, split_by_segment
 
-# of the yardstick that is fitted beside the networks, yardsticks.fit_profile_machine
+# folds of the reference method fitted beside the networks, yardsticks.fit_profile_machine
 FOLDS = 3
 
 
 def counted(by_part: dict[str, LabelledFrames]) -> dict[str, Any]:
-    """Frames, how many are valid, why others are not, segments, and valid ones of each class."""
+    """Returns the number of frames, of valid ones, the reasons of the others, the number of segments, and of
+    valid frames in each class."""
     valid = np.concatenate([frames.valid for frames in by_part.values()])
     label = np.concatenate([frames.label for frames in by_part.values()])
     reasons = [reason.split(":")[0] for frames in by_part.values() for reason in frames.reasons if reason]
@@ -31,7 +32,7 @@ def counted(by_part: dict[str, LabelledFrames]) -> dict[str, Any]:
 def deal_prints(
     frames: LabelledFrames, shares: Mapping[str, float], rng: np.random.Generator
 ) -> dict[str, LabelledFrames]:
-    """The frames by part, each with its share of the prints."""
+    """Returns the frames by part, each with its share of the prints."""
     rows = split_by_segment(_by_print(frames.take(frames.valid)), shares=tuple(shares.values()), rng=rng)
     prints = frames.print_number[frames.valid]
     return {
@@ -45,8 +46,8 @@ def _by_print(frames: LabelledFrames) -> Labelled:
 
 
 def check_parts(by_part: Mapping[str, LabelledFrames], *, recorded: bool, window: int) -> None:
-    """Raises ValueError if a class is learned in too few stretches for the yardstick's folds, or a part has
-    no window."""
+    """Raises ValueError if a class is learned from too few stretches for the reference method's folds, or if
+    a part has no window."""
     of = "prints" if recorded else "segments"
     learned = Labelled(*by_part["learned"].labelled())
     for c, name in enumerate(CLASS_NAMES):
@@ -68,6 +69,7 @@ def check_parts(by_part: Mapping[str, LabelledFrames], *, recorded: bool, window
 
 
 def all_frames(frames: LabelledFrames, *, recorded: bool) -> Labelled:
-    """All frames, rejected ones too; in a folder of recordings, what errs together is a print."""
+    """Returns all frames, also rejected ones. The unit of common errors is a print in a folder of recordings,
+    else a segment."""
     together = frames.print_number if recorded else frames.segment
     return Labelled(frames.images, frames.temperature, frames.label, frames.flow, together)

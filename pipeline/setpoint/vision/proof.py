@@ -1,19 +1,20 @@
-"""Whether a camera may be judged by: windows of prints that nothing was learned from must be named rightly,
-and the camera be told from others. One value, which the loop, the exports, `shadow` and the page obey."""
+"""Decides whether a camera may be used for control. Windows of prints that were not learned from must be
+classified correctly, and the camera must be distinguished from others. The loop, the exports, `shadow` and
+the page use this one result."""
 
 from typing import NamedTuple
 
 from pipeline.setpoint.frames.familiar import FALSE_ALARMS, needed_windows
 
-# one-sided, of the share of windows that are named rightly
+# one-sided, for the fraction of windows classified correctly
 CONFIDENCE = 0.9
 
 
 class CameraProof(NamedTuple):
-    """Of `windows` windows of `prints` prints (rendered segments if `rendered`) that nothing was learned from
-    a share `right` is named rightly, each class counted alike, and at least `low` with CONFIDENCE; `least` is
-    required. A window is named rightly if its class is the true one at its middle. `known_from`: windows by
-    which the camera is told from others."""
+    """Test on `windows` windows of `prints` prints (rendered segments if `rendered`) that were not learned
+    from. `right`: fraction classified correctly, each class counted alike; `low`: its lower bound with
+    CONFIDENCE; `least`: required. A window is correct if its class is the true one at its middle.
+    `known_from`: number of windows by which the camera is distinguished from others."""
 
     right: float
     low: float
@@ -32,7 +33,7 @@ def may_judge(proof: CameraProof) -> bool:
 
 
 def verdict(proof: CameraProof) -> str:
-    """One sentence on accuracy and verdict."""
+    """Returns one sentence with accuracy and verdict."""
     of = "rendered segments" if proof.rendered else "prints"
     right = (
         f"right in {100 * proof.right:.0f} % of {proof.windows:,} windows of {proof.prints:,} {of} "

@@ -1,8 +1,8 @@
-"""The networks that look at key areas: the paper's vision transformer and head (Li and Pattinson 2025, figure
-5a), and a small one.
+"""The networks for key areas: the paper's vision transformer and head (Li and Pattinson 2025, figure 5a), and
+a small one.
 
-Written on whole batches: every layer is one matrix product over (images x
-tokens). Weights are float32 and leave as named arrays.
+They work on whole batches: every layer is one matrix product over (images x tokens). Weights are float32 and
+are exported as named arrays.
 """
 
 from typing import NamedTuple
@@ -22,8 +22,8 @@ CENTRE_DEGC, SPREAD_DEGC = (
 
 
 class Size(NamedTuple):
-    """Patch (rows, columns) in px, token width, layers, heads, feed-forward width; `image_features` and
-    `temperature_features` are what the head concatenates."""
+    """`patch`: (rows, columns) in px; `width`: of tokens; `layers`; `heads`; `feed_forward`: its width;
+    `image_features` and `temperature_features`: concatenated by the head."""
 
     patch: tuple[int, int]
     width: int
@@ -57,8 +57,8 @@ class Dense(eqx.Module):
 
 @jax.custom_jvp
 def inverse_root(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """1 / sqrt(x), both rounded as IEEE 754 says. XLA would make an rsqrt of them, which begins with an
-    instruction that CPUs of two makers answer differently: the barrier keeps them apart."""
+    """Returns 1 / sqrt(x), with both operations rounded as IEEE 754 requires. XLA would merge them into an
+    rsqrt; its first instruction gives different results on CPUs of two makers. The barrier prevents this."""
     return 1.0 / jax.lax.optimization_barrier(jnp.sqrt(x))
 
 
@@ -102,8 +102,8 @@ class Block(eqx.Module):
         self.expand, self.contract = Dense(d, size.feed_forward, rng), Dense(size.feed_forward, d, rng)
 
     def __call__(self, x: Float[Array, "n tokens width"], wanted: int) -> Float[Array, "n wanted width"]:
-        """The first `wanted` tokens after the layer: of the last one the class token
-        alone is read, and the others are not worked out."""
+        """Returns the first `wanted` tokens after the layer. Of the last layer only the class token is read,
+        so the others are not computed."""
         n, tokens, d = x.shape
         normed, W, b = self.norm_1(x), self.queries_keys_values.W, self.queries_keys_values.b
         q = (normed[:, :wanted] @ W[:, :d] + b[:d]).reshape(n, wanted, self.heads, d // self.heads)
@@ -115,7 +115,7 @@ class Block(eqx.Module):
 
 
 class VisionTransformer(eqx.Module):
-    """Key areas -> the class token after the last layer and the final norm (n, width)."""
+    """Maps key areas to the class token after the last layer and the final norm (n, width)."""
 
     patches: Dense
     class_token: Float[Array, " width"]
@@ -155,8 +155,8 @@ class VisionTransformer(eqx.Module):
 
 
 class ClassifierHead(eqx.Module):
-    """relu of the image's and of the temperature's layer, concatenated, then one layer to the
-    classes: 33,363 parameters at the paper's size."""
+    """The relu of an image layer and of a temperature layer, concatenated, then one layer to the classes:
+    33,363 parameters at the paper's size."""
 
     image: Dense
     temperature: Dense
@@ -172,8 +172,8 @@ LOG_DEVIATION = (-2.0, 2.5)
 
 
 class FlowHead(eqx.Module):
-    """Features -> log(flow / 100 %) and its log deviation: one layer, ours; the paper's head names classes
-    only."""
+    """Maps features to log(flow / 100 %) and the log of its standard deviation with one layer. This head is
+    ours; the paper's head gives classes only."""
 
     flow: Dense
 
@@ -186,16 +186,16 @@ class FlowHead(eqx.Module):
 
 
 class Classifier(eqx.Module):
-    """Key area and nozzle temperature -> logits of the three flow classes, and beside them log flow with its
-    log deviation, from the same features."""
+    """Maps key area and nozzle temperature to logits of the three flow classes, and from the same features to
+    log flow with the log of its standard deviation."""
 
     body: VisionTransformer
     head: ClassifierHead
     flow_head: FlowHead
 
     def features(self, key_area: Array, temperature_degC: Array) -> Float[Array, "n features"]:
-        """What the last layer sees: image features, then temperature features. Each key area is scaled to
-        mean 0 and deviation 1, so that lighting does not matter."""
+        """Returns the input of the last layer: image features, then temperature features. Each key area is
+        scaled to mean 0 and deviation 1, so that lighting does not matter."""
         x = key_area.astype(jnp.float32)
         x = x - x.mean(axis=(1, 2), keepdims=True)
         x = x / (
@@ -210,13 +210,13 @@ class Classifier(eqx.Module):
         return self.head.classes(self.features(key_area, temperature_degC))
 
     def outputs(self, key_area: Array, temperature_degC: Array) -> tuple[Array, Array, Array]:
-        """Logits (n, 3), log(flow / 100 %) (n,) and its log deviation (n,)."""
+        """Returns logits (n, 3), log(flow / 100 %) (n,) and the log of its standard deviation (n,)."""
         features = self.features(key_area, temperature_degC)
         return self.head.classes(features), *self.flow_head(features)
 
 
 def vision_transformer(size: Size, rng: np.random.Generator) -> Classifier:
-    """A classifier with random weights: PAPER, SMALL, or a size of one's own."""
+    """Returns a classifier with random weights. `size`: PAPER, SMALL, or another one."""
     return Classifier(
         VisionTransformer(size, rng),
         ClassifierHead(size.width, size.image_features, size.temperature_features, rng),
@@ -225,20 +225,20 @@ def vision_transformer(size: Size, rng: np.random.Generator) -> Classifier:
 
 
 def parameters(tree) -> int:
-    """How many numbers are trained."""
+    """Returns the number of trained parameters."""
     return sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array)))
 
 
 def named_arrays(tree) -> dict[str, np.ndarray]:
-    """Every array of a network or of a training state by its path, e.g.
-    "body.blocks.0.expand.W"; numbers as arrays of shape ()."""
+    """Returns every array of a network or of a training state by its path, e.g. "body.blocks.0.expand.W";
+    numbers are arrays of shape ()."""
     paths = jax.tree_util.tree_flatten_with_path(eqx.filter(tree, eqx.is_array_like))[0]
     return {_name(path): np.asarray(leaf) for path, leaf in paths}
 
 
 def from_named_arrays(like, arrays: dict[str, np.ndarray]):
-    """`like` with its arrays replaced by those of the same names; raises ValueError where
-    names or shapes are those of another architecture."""
+    """Returns `like` with its arrays replaced by those of the same names. Raises ValueError if names or
+    shapes belong to another architecture."""
     paths, structure = jax.tree_util.tree_flatten_with_path(like)
     names = {_name(path): np.shape(leaf) for path, leaf in paths if eqx.is_array_like(leaf)}
     for name in sorted(names.keys() | arrays.keys()):

@@ -1,8 +1,8 @@
-"""The flow that a window of frames shows, with its spread, and the classes that follow from it.
+"""The flow that a window of frames shows, with its spread, and the class probabilities that follow from it.
 
-Each frame says a log flow with a deviation of its own. What they say is fitted to true flows on segments that
-the network never saw. Noise, ground and focus move what a whole segment shows: what the looks of a window
-(frames/familiar.py) say of that is taken off first.
+Each frame gives a log flow with its own standard deviation. These are fitted to true flows on segments that
+the network never saw. Noise, ground and focus shift the flow that a whole segment shows. This shift is
+predicted from the looks of a window (frames/familiar.py) and subtracted first.
 """
 
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from pipeline.setpoint.frames import familiar
 from pipeline.setpoint.frames.nozzle_scene import BORDERS
 
 CLASSES = 3
-# where the map from what frames show to the flow has its knots, in percent; between them it is linear
+# knots, in percent, of the map from what frames show to the flow; it is linear between them
 KNOTS_PERCENT = (
     10.0,
     20.0,
@@ -32,19 +32,19 @@ KNOTS_PERCENT = (
     310.0,
     620.0,
 )
-# windows that weigh as much as the wish for a straight map, and the flattest slope that is believed
+# weight of the penalty on changes of slope, in windows, and the smallest slope that is accepted
 STRAIGHT, LEAST_SLOPE = 3.0, 0.1
 
 
-# flows in percent from whose windows it is learned how looks move what is shown, the penalty of its ridge,
-# and the deviations beyond which a look says no more
+# range of flows in percent whose windows are used to fit the look correction, its ridge penalty, and the
+# number of deviations at which a look is clipped
 LOOKED_PERCENT, LOOK_PENALTY, FURTHEST_LOOK = (50.0, 200.0), 3.0, 3.0
 
 
 class LookCorrection(NamedTuple):
-    """By how much of log flow the looks of a window move what its frames show: c = weight' z with z the looks
-    less `mean` in units of `deviation`, (measures,) each; `explained` is the deviation of c, in the log flow
-    that is seen."""
+    """By how much the looks of a window shift the log flow that its frames show: c = weight' z, with z the
+    looks minus `mean` in units of `deviation`, (measures,) each. `explained`: standard deviation of c, in the
+    log flow that is seen."""
 
     mean: np.ndarray
     deviation: np.ndarray
@@ -56,12 +56,12 @@ NO_CORRECTION = LookCorrection(*(np.full(len(familiar.NAMES), x) for x in (0.0, 
 
 
 class FlowCalibration(NamedTuple):
-    """What turns the log flows of frames into that of a window: `shown` (k,) is what frames show on average
-    at the flows KNOTS_PERCENT, rising; `scale` (k,) multiplies their deviation there; `correlation` is that
-    of the errors of one segment's frames; `looks` what is taken off for what lies around the bead.
+    """Turns the log flows of frames into that of a window. `shown` (k,): what frames show on average at the
+    flows KNOTS_PERCENT, rising; `scale` (k,): multiplies their standard deviation there; `correlation`:
+    between the errors of frames of one segment; `looks`: correction for what lies around the bead.
 
-    A network that is sure of little says a flow nearer to those that it learned than the true one: the map
-    undoes that, so that a window at any flow shows that flow on average.
+    An unsure network gives a flow nearer to those that it learned than the true one. The map undoes that, so
+    that on average a window shows its true flow.
     """
 
     shown: np.ndarray
@@ -71,8 +71,8 @@ class FlowCalibration(NamedTuple):
 
 
 class WindowFlow(NamedTuple):
-    """Of w windows: flow_seen (w,) in percent of nominal, its relative standard deviation spread (w,), and
-    the probabilities prob (w, 3) of under, good, over. Without a valid frame: NaN, NaN and 1/3 each."""
+    """For w windows: `flow_seen` (w,) in percent of nominal; `spread` (w,), its relative standard deviation;
+    `prob` (w, 3), probabilities of under, good, over. Without a valid frame: NaN, NaN and 1/3 each."""
 
     flow_seen: np.ndarray
     spread: np.ndarray
@@ -82,13 +82,16 @@ class WindowFlow(NamedTuple):
 def window_flow(
     log_flow: np.ndarray, deviation: np.ndarray, valid: np.ndarray, looks: np.ndarray, fitted: FlowCalibration
 ) -> WindowFlow:
-    """The flow of w windows from log(flow / 100 %) of their frames with its deviation, valid (w, length), and
-    looks (w, measures).
+    """Returns the flow of w windows. `log_flow` and `deviation` (w, length): log(flow / 100 %) of the frames
+    and its standard deviation; `valid` (w, length); `looks` (w, measures).
 
-    What is shown is the mean of the m valid frames weighted by v_i = deviation_i^-2, less what the looks
-    explain, and flow_seen the flow at which frames show that on average. Frames of one segment repeat each
-    other: spread^2 = scale^2 (1 + (m - 1) correlation) / sum_i v_i (design effect; Kish 1965), and more
-    without looks (NaN).
+    The m valid frames are averaged with weights v_i = deviation_i^-2, and the effect of the looks is
+    subtracted. flow_seen is the flow at which frames show this value on average. Frames of one segment repeat
+    each other, so (design effect; Kish 1965)
+
+        spread^2 = scale^2 (1 + (m - 1) correlation) / sum_i v_i,
+
+    and it is larger if the looks are unknown (NaN).
     """
     shown, unscaled = _shown(log_flow, deviation, valid, fitted.correlation)
     moved = correction(fitted.looks, looks)
@@ -102,14 +105,15 @@ def window_flow(
 
 
 def correction(of: LookCorrection, looks: np.ndarray) -> np.ndarray:
-    """(w,) of log flow that is to be taken off for looks (w, measures); NaN for those that are not known."""
+    """Returns the log flow (w,) to subtract for looks (w, measures); NaN if they are unknown."""
     z = (looks - of.mean) / of.deviation
     return np.clip(z, -FURTHEST_LOOK, FURTHEST_LOOK) @ of.weight
 
 
 def fit_correction(looks: np.ndarray, residual: np.ndarray) -> LookCorrection:
-    """Ridge of what windows show too much of log flow, residual (w,), on their looks (w, measures); none of
-    fewer windows than three for each measure, by which it would learn noise."""
+    """Fits by ridge regression by how much windows show too much log flow, residual (w,), from their looks
+    (w, measures). Returns no correction for fewer than three windows for each measure, because it would fit
+    noise."""
     some = np.isfinite(looks).all(axis=1) & np.isfinite(residual)
     looks, residual = looks[some], residual[some]
     if len(looks) < 3 * looks.shape[1]:
@@ -124,8 +128,8 @@ def fit_correction(looks: np.ndarray, residual: np.ndarray) -> LookCorrection:
 def _shown(
     log_flow: np.ndarray, deviation: np.ndarray, valid: np.ndarray, correlation: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted mean of each window's frames, and its deviation before any scale (w,); NaN without a valid
-    frame."""
+    """Returns the weighted mean of each window's frames and its unscaled standard deviation (w,); NaN without
+    a valid frame."""
     m = valid.sum(axis=1)
     weight = np.where(valid, deviation, np.inf) ** -2.0
     total = np.where(m > 0, weight.sum(axis=1), np.nan)
@@ -138,12 +142,12 @@ def _knots() -> np.ndarray:
 
 
 def _hats(log_flow: np.ndarray) -> np.ndarray:
-    """(n, k) weights of the knots in linear interpolation at log_flow (n,)."""
+    """Returns the weights (n, k) of the knots in linear interpolation at log_flow (n,)."""
     return np.stack([np.interp(log_flow, _knots(), one) for one in np.eye(len(KNOTS_PERCENT))], axis=1)
 
 
 def _straight() -> np.ndarray:
-    """(k - 2, k): changes of slope at the inner knots, per unit of log flow."""
+    """Returns the changes of slope (k - 2, k) at the inner knots, per unit of log flow."""
     slopes = np.diff(np.eye(len(KNOTS_PERCENT)), axis=0) / np.diff(_knots())[:, None]
     return np.diff(slopes, axis=0)
 
@@ -151,13 +155,13 @@ def _straight() -> np.ndarray:
 def fit_flow(
     log_flow: np.ndarray, deviation: np.ndarray, valid: np.ndarray, looks: np.ndarray, flow: np.ndarray
 ) -> FlowCalibration:
-    """Map, scale, correlation and what is taken off for looks (w, measures), from windows (w, length) at
-    flows (w,) in percent, all of segments that were not learned from.
+    """Fits map, scale, correlation and look correction to windows (w, length) with looks (w, measures), at
+    flows (w,) in percent. Their segments must not have been used for training.
 
-    The map is least squares with its changes of slope weighed as STRAIGHT windows, before and after the looks
-    have explained what they can of its residuals; the correlation that of the standardised residuals of two
-    frames of a window (analysis of variance); the scale what makes the windows' squared errors as large as
-    they are, smoothed in the same way.
+    The map is a least-squares fit; each change of slope is penalised as much as STRAIGHT windows weigh. It is
+    fitted twice, before and after the correction for looks is fitted to its residuals. The correlation is
+    that of the standardised residuals of two frames of a window (analysis of variance). The scale matches the
+    windows' squared errors and is smoothed in the same way.
     """
     some = valid.any(axis=1)
     log_flow, deviation, valid, looks = (a[some] for a in (log_flow, deviation, valid, looks))
@@ -182,10 +186,10 @@ def fit_flow(
 
 
 def _fit_map(hats: np.ndarray, shown: np.ndarray) -> np.ndarray:
-    """(k,) what frames show at the knots, rising, from windows with the weights hats (w, k) that show
-    `shown` (w,) on average."""
+    """Returns what frames show at the knots (k,), rising. `hats` (w, k): weights of the windows; `shown`
+    (w,): what they show on average."""
     straight, knots = STRAIGHT * _straight().T @ _straight(), _knots()
-    slopes = np.eye(len(KNOTS_PERCENT))[[0, -1]] * 1e-6  # keeps ends that nobody saw finite
+    slopes = np.eye(len(KNOTS_PERCENT))[[0, -1]] * 1e-6  # keeps ends without data finite
     fitted = np.linalg.solve(
         hats.T @ hats + straight + slopes.T @ slopes, hats.T @ shown + slopes.T @ slopes @ knots
     )
@@ -196,18 +200,20 @@ def _fit_map(hats: np.ndarray, shown: np.ndarray) -> np.ndarray:
 
 
 def _correlation(residual: np.ndarray, valid: np.ndarray) -> float:
-    """Mean product of two valid frames of a window over the mean square of one, within 0 .. 1."""
+    """Returns the mean product of the residuals of two valid frames of a window over the mean square, within
+    0 .. 1."""
     r = np.where(valid, residual, 0.0)
     m = valid.sum(axis=1)
     pairs = (m * (m - 1)).sum()
     if pairs == 0:
-        return 1.0  # windows of one frame: nothing says that more would tell more
+        return 1.0  # windows of one frame: it is unknown if more frames would give more information
     products = (r.sum(axis=1) ** 2 - (r**2).sum(axis=1)).sum() / pairs
     return float(np.clip(products / ((r**2).sum() / m.sum()), 0.0, 1.0))
 
 
 def class_probabilities(log_flow: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """(n, 3) P(flow below 90 %, 90 to 110 %, above) under Normal(log_flow, spread) of log(flow / 100 %)."""
+    """Returns P(flow below 90 %, 90 to 110 %, above) (n, 3) if log(flow / 100 %) ~ Normal(log_flow,
+    spread)."""
     low, high = (np.log(border / 100) for border in BORDERS)
     under = scipy.special.ndtr((low - log_flow) / spread)
     over = scipy.special.ndtr((log_flow - high) / spread)

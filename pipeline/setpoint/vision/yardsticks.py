@@ -1,5 +1,5 @@
-"""What a network must beat: the bead's width by Otsu's threshold with two limits, and
-the bead's profile in a support vector machine."""
+"""Reference methods that a network must beat: the bead's width by Otsu's threshold with two limits, and a
+support vector machine on the bead's profile."""
 
 from typing import NamedTuple
 
@@ -13,23 +13,23 @@ from sklearn.svm import SVC
 
 
 class WidthRule(NamedTuple):
-    """Class 0 below `low`, 2 from `high` on, 1 between; in rows of the key area."""
+    """Class 0 below `low`, 2 from `high` on, 1 between. Widths are in rows of the key area."""
 
     low: float
     high: float
 
 
 class ProfileMachine(NamedTuple):
-    """A support vector machine on profiles, and the logistic map from
-    its three decision values to probabilities."""
+    """A support vector machine on profiles, and the logistic map from its three decision values to
+    probabilities."""
 
     machine: Pipeline
     probability: LogisticRegression
 
 
 def widths(images: np.ndarray) -> np.ndarray:
-    """(n,) width of the bead in each key area (n, 16, 48): mean over its
-    columns of the rows above Otsu's threshold, in rows."""
+    """Returns the width of the bead (n,) in each key area (n, 16, 48): the mean over its columns of the
+    number of rows at or above Otsu's threshold."""
     return np.array(
         [
             np.mean(image >= cv2.threshold(image, 0, 255, cv2.THRESH_OTSU)[0]) * image.shape[0]
@@ -39,8 +39,8 @@ def widths(images: np.ndarray) -> np.ndarray:
 
 
 def fit_width_rule(images: np.ndarray, label: np.ndarray) -> WidthRule:
-    """The two limits with the most right answers on key areas (n, 16, 48) with labels (n,) 0 1 2; exact, over
-    every pair of widths that occur."""
+    """Returns the two limits that classify most key areas (n, 16, 48) with labels (n,) 0 1 2 correctly. The
+    search is exact: it covers every pair of widths that occur."""
     width = widths(images)
     order = np.argsort(width, kind="stable")
     w, y = width[order], np.asarray(label)[order]
@@ -58,21 +58,22 @@ def fit_width_rule(images: np.ndarray, label: np.ndarray) -> WidthRule:
 
 
 def width_class(rule: WidthRule, images: np.ndarray) -> np.ndarray:
-    """(n,) classes of key areas (n, 16, 48)."""
+    """Returns the classes (n,) of key areas (n, 16, 48)."""
     width = widths(images)
     return (width >= rule.low).astype(np.int64) + (width >= rule.high)
 
 
 def profiles(images: np.ndarray, temperature: np.ndarray) -> np.ndarray:
-    """(n, 17): mean of each row of the key areas (n, 16, 48), and the temperature (n,) in degC."""
+    """Returns profiles (n, 17): the mean of each row of the key areas (n, 16, 48), and the temperature (n,)
+    in degC."""
     return np.column_stack([images.mean(axis=2), temperature])
 
 
 def fit_profile_machine(
     images: np.ndarray, temperature: np.ndarray, label: np.ndarray, segment: np.ndarray, *, folds: int = 3
 ) -> ProfileMachine:
-    """The machine (Gaussian kernel, C = 1) on all images, its probabilities from decision
-    values of folds whose segments it had not seen."""
+    """Fits the machine (Gaussian kernel, C = 1) to all images. Its probabilities are fitted to decision
+    values from `folds` folds, for segments that the machine had not seen."""
     x = profiles(images, temperature)
     machine = make_pipeline(StandardScaler(), SVC(decision_function_shape="ovr"))
     unseen = cross_val_predict(
@@ -82,5 +83,5 @@ def fit_profile_machine(
 
 
 def profile_probabilities(fitted: ProfileMachine, images: np.ndarray, temperature: np.ndarray) -> np.ndarray:
-    """(n, 3) probabilities of the classes 0 1 2."""
+    """Returns the probabilities of the classes 0 1 2 (n, 3)."""
     return fitted.probability.predict_proba(fitted.machine.decision_function(profiles(images, temperature)))
