@@ -4,7 +4,7 @@
 The setpoint stages do the same with images, trained networks and eight cases.
 """
 
-# %% The simulator of Li 2025 names a bead under, good or over. It is right 70 % of the time.
+# %% The simulator of Li 2025 classifies a bead as under, good or over. It is right 70 % of the time.
 import jax
 import jax.numpy as jnp
 import matplotlib

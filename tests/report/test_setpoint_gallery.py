@@ -45,7 +45,7 @@ def test_real_frames_stand_by_what_became_of_them_with_share_and_reason(project)
     places = [
         text.index(words)
         for words in (
-            "Accepted, and named rightly: 70 % of the frames",
+            "Accepted, and classified correctly: 70 % of the frames",
             "Accepted, and named wrongly: the surest first: 12 % of the frames",
             "Rejected by the front end: 15 % of the frames",
             "Foreign to the classifier: 2.5 % of the frames",

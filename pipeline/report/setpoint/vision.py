@@ -118,7 +118,7 @@ def data(sources: Sources) -> dict[str, Any]:
 
 # kinds of real frames in the order of the page
 GROUPS = {
-    "accepted": "Accepted, and named rightly",
+    "accepted": "Accepted, and classified correctly",
     "wrong": "Accepted, and named wrongly: the surest first",
     "rejected": "Rejected by the front end",
     "foreign": "Foreign to the classifier",
@@ -180,7 +180,7 @@ def by_flow(sources: Sources) -> dict[str, Any]:
     metrics = sources.metrics["train_classifier"]
     found = bins(metrics)
     ideal = any(row["ideal"] == row["ideal"] for row in found)
-    column = PictureColumn("Windows named rightly", "in per cent, by true flow", "", [_chart(found)])
+    column = PictureColumn("Windows classified correctly", "in per cent, by true flow", "", [_chart(found)])
     origin = page.origin(sources.source("train_classifier"))
     return {
         "picture": Picture("", [column], "", origin, "by-flow", BY_FLOW),
@@ -220,7 +220,7 @@ def _chart(worst_first: Sequence[Mapping[str, Any]]) -> Markup:
     return charts.panel(
         frame,
         layers,
-        alt=f"Windows are named rightly least often between {least['low']:g} and {least['high']:g} % of "
+        alt=f"Windows are classified correctly least often between {least['low']:g} and {least['high']:g} % of "
         f"flow, {number(least['right'].value, 0)} %",
         css="dd wide big",
         title="% of windows, against % of flow",

@@ -51,18 +51,18 @@ ANSWERS = {
 FIXED = {
     "quantile": (
         "90 % quantile",
-        "Nine in ten of all cases (plants, starts, references, noise) are better than this figure. "
-        "Its band says "
-        "where it would lie for other plants of the same spread.",
+        "Nine in ten of all cases (plants, starts, references, noise) are better than this figure. Its "
+        "band says where it would lie for other plants of the same spread.",
     ),
     "pair": (
         "The pair",
-        "The model-based contestant against the data-driven one, tuned with the same budget and cost, on the "
-        "same plants: a paired test over plants. Each kind is stood for by the one that tuning found "
-        "cheapest on the training plants. A difference counts only if it is larger than its standard "
-        "deviation over structures of machines: another structure would then keep its sign in four of five. "
-        "The percentage is of the typical ratio of their costs (geometric mean, every case counts alike); "
-        "the 90 % quantiles of the table are of the dear cases.",
+        "The model-based controller against the data-driven one, tuned with the same budget and cost, on "
+        "the same plants: a paired test over plants. Each kind is represented by the controller that cost "
+        "least on the training plants. A difference counts only if it is larger than its standard "
+        "deviation over structures of machines; then the same controller would win on four in five "
+        "machines of another structure. The percentage is that of the typical ratio of their costs "
+        "(geometric mean, every case counts alike); the 90 % quantiles of the table are those of the "
+        "costly cases.",
     ),
     "crossings": (
         "Crossings",
@@ -71,27 +71,27 @@ FIXED = {
     "false_stops": (
         "False stops",
         "Each controller runs with its supervisor on four healthy machines, through set-point changes, a "
-        "door, a fan and another room. Counted are the runs in which the supervisor leaves the law.",
+        "door, a fan and another room. This counts the runs in which the supervisor stops the control "
+        "law.",
     ),
     "cost": (
         "Cost as deployed",
-        "The declared engineering cost of a run as the controller runs: limits, integrator, "
-        "hand-over and noise "
-        "in it. It is what every contestant was tuned for.",
+        "The declared engineering cost of a run, with limits, integrator, hand-over and noise, as the "
+        "controller runs on a machine. Every controller was tuned for it.",
     ),
     "passed": (
         "Passed",
-        "The whole band lies inside the limit. Failed: the whole band lies outside. Undecided: "
-        "it straddles the limit, and does not pass.",
+        "The whole band lies inside the limit. Failed: the whole band lies beyond the limit. Undecided: "
+        "the band includes the limit; this does not pass.",
     ),
     "margin_disk": (
         "Disk margin",
-        "Change of gain and phase, in all channels at once, that the loop bears before it oscillates; "
-        "0.4 bears gains from 2/3 to 3/2.",
+        "How much gain and phase may change, in all channels at once, before the loop oscillates; a "
+        "margin of 0.4 allows gains from 2/3 to 3/2.",
     ),
     "margin_delay": (
         "Delay margin",
-        "Extra delay of all sensors, in seconds, that the loop bears before it oscillates.",
+        "How much extra delay of all sensors, in seconds, the loop tolerates before it oscillates.",
     ),
     "verdict": (
         "Verdict",
@@ -113,8 +113,8 @@ FIXED = {
     ),
     "peak": (
         "Largest error once settled",
-        "How far the worst zone is from its reference at most, once the controller has settled: a loop that "
-        "swings around its reference has no settled error, and is no good.",
+        "How far the worst zone is from its reference at most, once the controller has settled. A loop "
+        "that swings around its reference can have a mean error of zero.",
     ),
     "heating": (
         "Settling from cold",
@@ -135,16 +135,15 @@ FIXED = {
     "accepted": ("Accepted run", "The last run that a person marked as good with ./run beadline accept."),
     "at_limits": (
         "Time at limits",
-        "Share of all commands beyond what the machine can give. A controller’s are clipped to it; doing "
-        "nothing goes on with the inputs of the start, below 0 where only that holds the start still.",
+        "Share of all commands that are beyond what the machine can give. A controller’s commands are "
+        "clipped; “hold” keeps the inputs of the start, even below 0 if only that holds the start.",
     ),
     "trusted": (
         "Trusted",
-        "To simulate: the rules simulation and stability. To predict: the rule ahead. To design controllers: "
-        "ahead, inputs used up, "
-        + "excitation, effects known, stability, and where inputs are declared to heat "
-        "no gain whose whole band is impossible. Whiteness is a reservation: where "
-        "it fails, a better observer exists.",
+        "To simulate: the rules simulation and stability. To predict: the rule ahead. To design "
+        "controllers: ahead, inputs used up, excitation, effects known, stability, and, if inputs are "
+        "declared to heat, no gain whose whole band is impossible. If the whiteness test fails, a better "
+        "observer exists; this is a warning only.",
     ),
     "fit": (
         "Fit",
@@ -159,11 +158,11 @@ FIXED = {
         "Ahead",
         "The model predicts so far ahead from all outputs until then, and from the inputs throughout.",
     ),
-    "held": ("Held", "The last output seen, held so long: what any prediction must beat."),
+    "held": ("Held", "The last output, repeated for that long. Any prediction must be better."),
     "free_mean": (
         "Free mean",
-        "The same simulation, moved by the mean of its error. What it gains is what another ambient or "
-        "operating point costs.",
+        "The same simulation, shifted by the mean of its error. What the shift gains is the cost of "
+        "another ambient or operating point.",
     ),
     "closed_loop": (
         "Closed loop",
@@ -190,13 +189,12 @@ FIXED = {
     ),
     "fit_band": (
         "Band of a fit",
-        "Where 90 of 100 hold-outs of this length would lie, by resampling blocks of it. "
-        "A fit whose band straddles its limit is undecided.",
+        "90 of 100 hold-outs of this length would lie in this band (blocks of the hold-out are "
+        "resampled). A fit whose band includes its limit is undecided.",
     ),
     "whiteness": (
         "Whiteness",
-        "The errors of predicting one step ahead are noise: none tells the next. "
-        "Ljung and Box’s test at 99 %.",
+        "The one-step prediction errors are noise: none predicts the next one. Ljung and Box’s test at 99 %.",
     ),
     "inputs_left": (
         "Inputs used up",
@@ -209,14 +207,14 @@ FIXED = {
     ),
     "identified_spread": (
         "Spread",
-        "Plants identified anew from records rebuilt with resampled errors: "
-        "as different as the record allows, and one order higher. Bands of step responses reach at least as "
-        "far as fits without one quarter of the record tell apart.",
+        "Plants identified again from records with resampled errors, also of one order higher: they "
+        "differ as much as the record allows. Bands of step responses also cover what fits without one "
+        "quarter of the record give.",
     ),
     "on_off": (
         "On\u2011off control",
-        "Wanted flow over the gain known beforehand: what a machine does that knows nothing of its own "
-        "slowness. Its error is 100 %.",
+        "Wanted flow divided by the known gain: what a machine does if nobody knows how slow it is. Its "
+        "error is 100 %.",
     ),
     "pressure_advance": (
         "Pressure advance",
@@ -246,29 +244,29 @@ FIXED = {
     ),
     "whole": (
         "Learned whole",
-        "Trials of this very part by our law: the best that learning gives, "
-        "and a yardstick for signals composed without it.",
+        "Trials of this very part by our law: the best that learning gives. Signals composed without such "
+        "trials are compared with it.",
     ),
     "forecast": (
         "Forecast",
-        "The 90 % interval of what may come out, before anything is printed: of the chains that the trials "
-        "cannot tell apart, with what they missed on routines left out. Not judged: the trials do not tell; "
-        "the reason and the trial that would tell stand beside it. "
-        "True figures come from a simulated machine that nothing was fitted to.",
+        "The 90 % interval of the result before anything is printed: of the chains that the trials cannot "
+        "distinguish, widened by their errors on routines that they were not fitted to. Not judged: the "
+        "trials do not determine it; the reason and the trial that would help stand beside it. True "
+        "figures come from a simulated machine that nothing was fitted to.",
     ),
     "lead": (
         "Lead",
-        "How long before its event a signal must begin: the material answers late. "
-        "A line shorter than it leaves Stop no room.",
+        "How long before its event a signal must begin, because the material responds late. In a line "
+        "shorter than the lead there is no time for the Stop signal.",
     ),
     "trial": (
         "Trial",
-        "One run of the training routine: off, on, a pause of the gantry that stands for a corner, on, off. "
-        "Trial 0 is on\u2011off control.",
+        "One run of the training routine: off, on, a pause of the gantry that simulates a corner, on, "
+        "off. Trial 0 is on\u2011off control.",
     ),
     "through_pictures": (
         "Through pictures",
-        "The flow is not told to the law but measured from camera frames of the bead, "
+        "The law does not get the true flow. It gets the flow measured from camera frames of the bead, "
         "trial by trial, as on a machine.",
     ),
     "gamma": (
@@ -278,8 +276,8 @@ FIXED = {
     ),
     "saturation": (
         "Saturation",
-        "The command asks for more than the drive can give and is cut off. "
-        "No law makes up for it; longer ramps do.",
+        "The command asks for more than the drive can give and is clipped. No law makes up for it; longer "
+        "ramps do.",
     ),
     "line_volume": (
         "Line volume",
@@ -293,29 +291,29 @@ FIXED = {
     ),
     "settles": (
         "Settle",
-        "Flow within 90–110 % and nozzle within 210 ± 5 °C from some decision up to the 90th, "
-        "until the 100th. The true flow counts, which no controller is told.",
+        "Flow within 90–110 % and nozzle within 210 ± 5 °C from the 90th decision at the latest until the "
+        "100th. The true flow counts; no controller knows it.",
     ),
-    "stays": ("Stay", "Settled, and never outside again until decision 200."),
+    "stays": ("Stay", "Settled, and inside from then on until decision 200."),
     "recovers": (
         "Recover",
-        "Inside from some decision up to the 90th until the 120th, "
-        "though at the 60th the nozzle clogged to 60 % of its flow.",
+        "At decision 60 the nozzle clogs to 60 % of its flow. Recovered: inside again from decision 90 at "
+        "the latest until decision 120.",
     ),
     "agent": (
         "Agent",
-        "A network that learned in simulation what to change: rewards teach it, "
-        "and nobody tells it a model of the machine (deep Q-learning).",
+        "A network that learned in simulation what to change. It learns from rewards and gets no model of "
+        "the machine (deep Q-learning).",
     ),
     "as_published": (
         "As published",
-        "The paper’s own agent, network, four phases and settings, trained by its recipe. "
-        "What the paper prints no value for is in params.expert.yaml or in the notes.",
+        "The paper’s own agent: its network, four phases and settings, trained as the paper says. Values "
+        "that the paper does not publish are in params.expert.yaml or in the notes.",
     ),
     "bayes": (
         "Bayes filter",
-        "Keeps a list of how likely each flow is, corrects it with every window by how often such windows "
-        "come at that flow, and moves towards 100 %.",
+        "Keeps a probability for each flow, corrects it with every window by how often such windows occur "
+        "at that flow, and moves towards 100 %.",
     ),
     "sequential": (
         "Sequential test",
@@ -323,37 +321,39 @@ FIXED = {
     ),
     "recorded_windows": (
         "Classified windows",
-        "Windows that the trained classifier really named, drawn again by the flow of the moment: "
-        "its errors sit at the class borders and persist.",
+        "Windows that the trained classifier really classified, sampled again by the present flow. Its "
+        "errors lie at the class borders and last for several decisions.",
     ),
     "segment": (
         "Segment",
-        "A stretch of one print whose pictures share light, place and bead: intervals draw it anew.",
+        "A stretch of one print whose pictures share light, place and bead. Intervals resample whole "
+        "segments.",
     ),
     "clog": (
         "Clog, half clog",
-        "From one decision on, which the name beside it tells, less comes out than the extruder moves: the "
-        "share that is left stands there. Half clog: more is left than after a clog.",
+        "From the named decision on, less material comes out than the extruder feeds; the share that "
+        "still flows stands beside the name. After a half clog more flows than after a clog.",
     ),
     "good_starts": (
         "Perfect, in band",
-        "Prints that nothing is wrong with: the flow begins at 100 %, or somewhere within the band of good. "
-        "What a controller spoils of them is its harm.",
+        "Prints without a fault: the flow begins at 100 %, or somewhere within the good band. Harm is "
+        "what a controller spoils of them.",
     ),
     "faulty_camera": (
         "Stuck, blind, another camera, borders",
-        "The camera shows one picture again and again, or no line, for as many decisions as stand there; it "
-        "is of another make than the one learned; or its borders between the classes lie elsewhere.",
+        "Stuck: the camera shows one picture again and again. Blind: it shows no line. Both last for the "
+        "number of decisions that stands there. Another camera: not the one that was learned. Borders: "
+        "its borders between the classes lie elsewhere.",
     ),
     "sticky": (
         "Sticky",
-        "The conditions of a picture last for about ten decisions, so that an error comes again; fresh: "
-        "each window is of another segment.",
+        "The conditions of a picture last for about ten decisions, so an error repeats. Fresh: each "
+        "window is of another segment.",
     ),
     "accuracy": (
         "Accuracy",
-        "Share of windows that the paper’s simulator names rightly; "
-        "the rest gets one of the two other classes.",
+        "Share of windows that the paper’s simulator classifies correctly; the others get one of the two "
+        "other classes.",
     ),
     "worst_case": (
         "Worst case",
@@ -363,9 +363,9 @@ FIXED = {
     ),
     "interval": (
         "Interval",
-        "Where the true share lies with 95 % confidence, for as many runs as were made: Wilson’s, "
-        "or, where the runs share segments of a print, drawn anew by segment. "
-        "A share that straddles its limit is undecided.",
+        "The true share lies here with 95 % confidence, for the number of runs made: Wilson’s interval, "
+        "or, if runs share segments of a print, resampled by segment. A share whose interval includes its "
+        "limit is undecided.",
     ),
     "key_area": (
         "Key area",
@@ -378,23 +378,23 @@ FIXED = {
     ),
     "held_window": (
         "Held",
-        "Nothing is sent: too few frames show a line, they are foreign, or the tip moved. "
-        "A window in which two classes remain possible is weighed by its flow, and may move the controller.",
+        "Nothing is sent: too few frames show a line, they are foreign, or the tip moved. If two classes "
+        "remain possible, the window counts by its flow and may move the controller.",
     ),
     "foreign": (
         "Foreign",
-        "A picture that lies further from all that was learned than 95 % of familiar ones (Mahalanobis "
-        "distance of the features).",
+        "A picture whose features are further from the training data than those of 95 % of familiar "
+        "pictures (Mahalanobis distance).",
     ),
     "reward": (
         "Reward",
-        "1 at 100 % and 210 °C, falling along ellipses that lean: a hotter nozzle wants less flow. "
-        "The semi-axes a, b say how soon.",
+        "1 at 100 % and 210 °C, falling along tilted ellipses, because a hotter nozzle needs less flow. "
+        "The semi-axes a, b say how fast.",
     ),
     "study": (
         "The study",
-        "The published work whose method this is; “as published” repeats its own way of "
-        "counting, digit by digit.",
+        "The published work that gives the method; “as published” repeats its own way of counting, digit "
+        "by digit.",
     ),
 } | {
     contestant.name: (contestant.word or contestant.heading, contestant.explanation)
