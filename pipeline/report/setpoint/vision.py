@@ -220,8 +220,8 @@ def _chart(worst_first: Sequence[Mapping[str, Any]]) -> Markup:
     return charts.panel(
         frame,
         layers,
-        alt=f"Windows are classified correctly least often between {least['low']:g} and {least['high']:g} % of "
-        f"flow, {number(least['right'].value, 0)} %",
+        alt="Windows are classified correctly least often between "
+        f"{least['low']:g} and {least['high']:g} % of flow, {number(least['right'].value, 0)} %",
         css="dd wide big",
         title="% of windows, against % of flow",
         units=("%", "%"),
