@@ -115,6 +115,16 @@ def test_help_has_twelve_commands_in_groups_and_each_line_begins_with_a_verb(bea
         assert f"{group}:\n" + "\n".join(f"  {name:<12}{line}" for name, line in commands.items()) in text
 
 
+def test_all_commands_together_have_at_most_45_options():
+    options = [
+        (name, names[0])
+        for name, command in cli.COMMANDS.items()
+        for names, _ in command.arguments
+        if names[0].startswith("-")
+    ]
+    assert len(options) <= 45, options
+
+
 @pytest.mark.parametrize("name", list(cli.COMMANDS))
 def test_the_help_of_a_command_has_an_example_exit_statuses_and_defaults(beadline, name):
     status, text, _ = beadline(*name.split(), "--help")
@@ -144,7 +154,7 @@ def test_the_help_of_a_command_of_several_parts_names_them_with_an_example(beadl
     [
         (["inspct", "log.csv"], "inspect"), (["calibrate", "cam"], "camera"),
         (["init", "a.csv", "--coppy"], "--copy"),
-        (["nightly", "--roll-back"], "--rollback"), (["calibrate", "levels", "in", "--setle=3"], "--settle"),
+        (["nightly", "--roll-back"], "--rollback"), (["calibrate", "levels", "in", "--hodl=3"], "--hold"),
     ],
 )  # fmt: skip
 def test_a_mistyped_command_or_option_is_answered_with_the_closest_one(beadline, typed, meant):

@@ -25,6 +25,8 @@ from pipeline.store.printable import counted, printable_page
 
 # classes of the published material lie between these, in percent
 BORDERS = np.array(PLA.good_flow_percent)
+# the share of each hold, after the change of flow, in which the melt still follows
+SETTLES = 1 / 6
 # of the page's drawing
 WIDTH, HEIGHT, MARGIN = 560, 360, 40
 

@@ -24,7 +24,7 @@ from pipeline.store import artifacts, params
 
 # what a printer can be told: percent of flow, degC; pictures a second; seconds
 BOUNDS = {"--flow": (1.0, 1000.0), "--temperature": (0.0, 600.0), "--rate": (0.05, 100.0),
-          "--hold": (5.0, 3600.0), "--settle": (0.0, 600.0)}  # fmt: skip
+          "--hold": (5.0, 3600.0)}  # fmt: skip
 
 
 WEIGHTS = "datasets/train_classifier/weights.safetensors"
@@ -110,9 +110,12 @@ def of_camera(
     return WindowFlow(seen, np.where(some, of.spread, np.nan), prob)
 
 
-def asked(flow: float, temperature: float, tip: str, *, once: bool, settings: Ready) -> WatchOptions:
-    """What the command line says, checked; the tip of the settings where it says none."""
+def asked(flow: float, temperature: float | None, tip: str, *, once: bool, settings: Ready) -> WatchOptions:
+    """What the command line says, checked; if it says none, the best temperature of the material and the tip
+    of the settings."""
     bounded("--flow", flow)
+    if temperature is None:
+        temperature = settings.deployed.material.best_temperature_degC
     bounded("--temperature", temperature)
     return WatchOptions(flow, temperature, pixel(tip) if tip else settings.tip, once)
 

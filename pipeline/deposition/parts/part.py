@@ -41,9 +41,8 @@ class ComposedPart(NamedTuple):
     bead_area_mm2: float
 
 
-def parse(data: bytes, *, scale: float = 1.0, speed: float = 1.0, extruder: str = "") -> PartProgram:
-    """The part program with X, Y and Z `scale` times as large and feeds `speed` times as fast. Raises
-    ValueError if nothing of it prints because what would was refused."""
+def parse(data: bytes, *, extruder: str = "") -> PartProgram:
+    """The part program. Raises ValueError if nothing of it prints because what would was refused."""
     program = gcode.parse(data, extruder=extruder)
     if not np.any(program.moves.kind == gcode.Kind.EXTRUDE) and program.refusals:
         first = program.refusals[0]
@@ -51,7 +50,7 @@ def parse(data: bytes, *, scale: float = 1.0, speed: float = 1.0, extruder: str 
             f"line {first.line}: {first.why}; it was left out, "
             "and nothing of the program that could be read prints"
         )
-    return extrusion.resized(program, scale=scale, speed=speed)
+    return program
 
 
 def compose(
