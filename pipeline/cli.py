@@ -60,7 +60,7 @@ def accept(_: argparse.Namespace) -> None:
 
 
 def _today() -> dict[str, str]:
-    """The day, and the commit that is checked out; "none" where there is none."""
+    """The day, and the commit that is checked out; "none" if there is none."""
     head = subprocess.run(
         ["git", "rev-parse", "--short=8", "HEAD"], capture_output=True, text=True, check=False
     )

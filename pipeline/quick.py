@@ -195,7 +195,7 @@ def _furnish(folder: Path, files: Files, smaller: list[tuple[str, str, str]], ro
 
 def _copy_kept(folder: Path) -> str:
     """The kept artifacts in the places of their stages; the commit that they were made at. Raises ValueError
-    where one is missing or not as it was kept."""
+    if one is missing or not as it was kept."""
     index = KEPT / "kept.json"
     kept = artifacts.read_json(index) if artifacts.exists(index) else None
     if not isinstance(kept, dict) or not isinstance(kept.get("files"), dict):
@@ -213,7 +213,7 @@ def _copy_kept(folder: Path) -> str:
 
 def keep() -> str:
     """Puts the classifier of this checkout's full run into KEPT, in place of the one before. Raises
-    ValueError where there is none."""
+    ValueError if there is none."""
     folder = Path("datasets", TRAINED)
     if not artifacts.exists(folder / "weights.safetensors"):
         raise ValueError(f"{folder}: expected what training left, found none; ./run dvc repro {TRAINED}")

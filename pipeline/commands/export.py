@@ -54,7 +54,7 @@ KLIPPER is the folder of Klipper (often ~/klipper), CONFIG that of printer.cfg (
 
 
 def files(made: Exported, shown: Certificate, to: str) -> dict[str, str]:
-    """The files of one form, name to text. Raises ValueError, naming what is missing, where the machine or
+    """The files of one form, name to text. Raises ValueError, naming what is missing, if the machine or
     the certificate does not allow it."""
     if to == "c":
         texts = to_c.files(made, shown, vectors.golden(made))
@@ -78,8 +78,7 @@ def export(folder: Path, to: str, out: Path | None) -> str:
     target = folder / to if out is None else out
     if target.exists() and not target.is_dir():
         raise ValueError(
-            f"--out {target}: should be a folder but is a file; name a folder, which is made where it is "
-            "missing"
+            f"--out {target}: should be a folder but is a file; name a folder, which is made if it is missing"
         )
     if shows_frames(folder):
         return _export_readers(folder, to, target)

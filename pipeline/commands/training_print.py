@@ -85,7 +85,7 @@ class PrintProgram(NamedTuple):
 
 
 def numbers(text: str, flag: str, count: int = 0) -> tuple[float, ...]:
-    """The numbers of a flag, such as 60,80,100, each within its bounds; as many as `count`, where not 0."""
+    """The numbers of a flag, such as 60,80,100, each within its bounds; as many as `count`, if not 0."""
     low, high, unit = BOUNDS[flag]
     try:
         values = tuple(float(part) for part in text.split(","))
@@ -246,7 +246,7 @@ def _raster(asked: TrainingPrint, z: float, flow: float, *, along_x: bool) -> tu
 
 
 def _heat(asked: TrainingPrint, before: PrintLayer | None, temperature: float, z: float) -> list[str]:
-    """Where the temperature of a layer is another one, the nozzle waits for it beside the part; R waits for
+    """If the temperature of a layer is another one, the nozzle waits for it beside the part; R waits for
     cooling too."""
     if before is not None and before.temperature == temperature:
         return []

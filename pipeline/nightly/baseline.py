@@ -82,7 +82,7 @@ def measured(
     without: Sequence[ProductionModel] | None = None,
 ) -> Baseline:
     """The baseline of a champion's nights, each held against the model of `without` that was identified
-    without it (None: the champion's own). Raises ValueError where they are too short."""
+    without it (None: the champion's own). Raises ValueError if they are too short."""
     together = [pair for night in nights for pair in night]
     loose = _loose(machine, together)
     record = drift.record(machine, together, loose)

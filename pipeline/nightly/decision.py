@@ -29,7 +29,7 @@ def decide(
     alarms: Sequence[Alarm],
     seed: int,
 ) -> LoopDecision:
-    """Promote where the paired test finds the challenger better by at least `rule.least_improvement_percent`,
+    """Promote if the paired test finds the challenger better by at least `rule.least_improvement_percent`,
     no guard is worse by more than `allowed`, and nothing has drifted: `alarms` are those of this loop
     alone."""
     if champion is None:
@@ -62,7 +62,7 @@ def decide(
 
 
 def _first(challenger: CaseCosts) -> LoopDecision:
-    """Where there is no champion, a challenger that is fit becomes one."""
+    """If there is no champion, a challenger that is fit becomes one."""
     failing = [case for case, (_, cost) in challenger.cases.items() if not np.isfinite(cost)]
     reasons = _unfit(challenger)
     if not challenger.cases:
@@ -88,7 +88,7 @@ def _unfit(challenger: CaseCosts) -> list[str]:
 
 
 def _percent(value: float) -> str:
-    """ "5.0 %"; "beyond 1,000 %" where the figure says nothing."""
+    """ "5.0 %"; "beyond 1,000 %" if the figure says nothing."""
     return beyond_meaning(value, "%").replace(THIN, " ") or f"{_tenths(value)} %"
 
 

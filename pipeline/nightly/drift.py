@@ -226,7 +226,7 @@ class DriftRecord(NamedTuple):
 def record(
     machine: ProductionModel, segments: Segments, scale: Scatter, room: RoomAir = RESTLESS
 ) -> DriftRecord:
-    """A record ready to be asked. Raises ValueError where it is too short."""
+    """A record ready to be asked. Raises ValueError if it is too short."""
     n, p = machine.plant.n, machine.plant.p
     long = [(u, y) for u, y in segments if len(y) >= 4 * n + 8]
     measured = sum(int(np.isfinite(y).any(axis=1).sum()) for _, y in long)

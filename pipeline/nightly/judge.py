@@ -96,7 +96,7 @@ def _deposition(folder: Path) -> CaseCosts:
         )
         for k in rows
     }
-    # missing where no line is long enough, or its forecast is not judged: that is no good line
+    # missing if no line is long enough, or its forecast is not judged: that is no good line
     lines = [float(volume) for k in rows if np.isfinite(volume := table["worst_line_volume_percent"][k])]
     guards = {"worst_line_volume_percent": max(lines)} if lines else {}
     return CaseCosts(joblib.hash(sorted(cases)), cases, guards)
@@ -243,7 +243,7 @@ def _closed_loop(frozen: FrozenPanel, folder: Path, contestant: str, rule: Promo
 
 def judged(frozen: FrozenPanel, folder: Path, name: str) -> evaluation.ControllerOutcome:
     """The contestant `name` whose files lie below `folder`, as it would be deployed: its own governor,
-    today's limits. Raises NotComparable where it cannot be designed from them."""
+    today's limits. Raises NotComparable if it cannot be designed from them."""
     try:
         design, setting = _designed(frozen, folder, name)
     except ValueError as reason:
@@ -290,7 +290,7 @@ def identified(folder: Path) -> plant.Plant:
 
 
 def _predictor(folder: Path, name: str, machine: Machine) -> plant.Plant:
-    """The model that a contestant predicts with: the window where it was learned from one."""
+    """The model that a contestant predicts with: the window if it was learned from one."""
     if table.BY_NAME[name].learned_from not in ("window", "kernel", "trajectories"):
         return identified(folder)
     long = window.restored(artifacts.read_arrays(folder / "learn_kernel/window.parquet", "window", 1))
@@ -298,7 +298,7 @@ def _predictor(folder: Path, name: str, machine: Machine) -> plant.Plant:
 
 
 def _holdout_records(h: HoldOut, machine: Machine) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The hold-out recordings as gapless segments. Raises ValueError where there is none that can be read."""
+    """The hold-out recordings as gapless segments. Raises ValueError if there is none that can be read."""
     if not Path(h.recordings).is_dir():
         raise ValueError(
             f"{h.recordings}: expected recordings that nothing is trained on, found none; "
@@ -402,7 +402,7 @@ def _panel_plants(
 
 
 def _prediction_error(model, records: list[tuple[np.ndarray, np.ndarray]]) -> float | None:
-    """Root mean square one-step error in °C on the hold-out recordings, None where there are none."""
+    """Root mean square one-step error in °C on the hold-out recordings, None if there are none."""
     if not records:
         return None
     from pipeline.temperature.identification import validation

@@ -49,7 +49,7 @@ SENSOR = "sensor"  # kind of an alarm that stands above every other: a sensor th
 class Alarm(NamedTuple):
     """A change of one loop: the key by which the next night knows it again, and the recording that shows it.
     Then its cause in words, how many sigmas it is from no change, and what follows from it in words. `kind`
-    and `channel` are the cause for a machine to read, empty where it has none: gain, time constant, delay,
+    and `channel` are the cause for a machine to read, empty if it has none: gain, time constant, delay,
     saturation, offset, noise, ambient, sensor, or several with "or" between; a signal's name, or "every
     input"."""
 

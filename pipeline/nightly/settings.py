@@ -10,7 +10,7 @@ from pipeline.store.params import Section
 
 
 def _in_the_project(path: str) -> str:
-    """A path that the night copies or moves. Raises ValueError where it lies elsewhere."""
+    """A path that the night copies or moves. Raises ValueError if it lies elsewhere."""
     if path.startswith(("/", "~")) or ".." in path.split("/"):
         raise ValueError("but must lie in the project's folder")
     return path
@@ -35,7 +35,7 @@ class NightlyLoop(Section):
         if (self.judge == "cases") != bool(self.cases):
             raise ValueError(
                 f'has judge {self.judge} but cases "{self.cases}"; '
-                "name the file of costs where judge is cases, and only there"
+                "name the file of costs if judge is cases, and only there"
             )
         if self.cases and self.cases not in self.artifacts:
             raise ValueError(
@@ -83,8 +83,8 @@ class HoldOut(Section):
 
 
 class DriftLimits(Section):
-    """What matters of each figure, and how sure the night must be. A change of the machine is an alarm where
-    its estimate, pooled over nights, is past its limit by `limit_sigmas`; a picture or the closed loop where
+    """What matters of each figure, and how sure the night must be. A change of the machine is an alarm if
+    its estimate, pooled over nights, is past its limit by `limit_sigmas`; a picture or the closed loop if
     it leaves its band by `alarm_sigmas` at once, or by `watch_sigmas` two nights running."""
 
     limit_sigmas: float = Field(ge=0, le=100)

@@ -105,7 +105,7 @@ class RecordingChange(NamedTuple):
 
 def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict[str, Any] | None:
     """champion/<loop>/reference.json of the model below `folder`, from the loop's recordings, or `only` those
-    named; None where they are none, or too short."""
+    named; None if they are none, or too short."""
     machine = recorded(params.load(Plant, "plant"), "datasets/ingest/record.parquet")
     records = judge.read_records(Path(loop.recordings), machine, {})
     named = [path.removeprefix(f"{loop.recordings}/") for path in only] or sorted(records)
@@ -139,7 +139,7 @@ def reference(loop: NightlyLoop, folder: Path, only: Sequence[str] = ()) -> dict
 
 def _without_each(machine: Plant, nights: Sequence[Segments], samples: int) -> list[ProductionModel]:
     """For each night a model that was identified without it, as a new night's is: what such a model gets
-    wrong of it is no change of the machine. Nights share FOLDS models. Raises ValueError where the others do
+    wrong of it is no change of the machine. Nights share FOLDS models. Raises ValueError if the others do
     not determine one."""
     own = params.read()["identify_plant"]
     settings = model_choice.Settings(offset=own["offset"], max_order=own["max_order"])
@@ -531,7 +531,7 @@ def _tell_least(fits: Sequence[CauseFit], production: ProductionReference) -> st
 
 
 def _closed_loop(record: Mapping[str, np.ndarray], machine: Plant) -> dict[str, list[list[float]]]:
-    """Offset of each output from its set-point where it is settled in °C, root mean square of each input and
+    """Offset of each output from its set-point if it is settled in °C, root mean square of each input and
     its share of samples at a limit, both in percent, and the settled set-points in °C: [figures, their
     standard deviations], from PARTS of the record, which are longer than what a loop remembers. Empty where
     nothing is settled."""

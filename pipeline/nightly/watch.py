@@ -66,7 +66,7 @@ def hide_secrets(settings: Nightly) -> Nightly:
 
 
 def _server(url: str) -> str:
-    """Of a URL what is no secret; empty where there is none."""
+    """Of a URL what is no secret; empty if there is none."""
     try:
         parts = urllib.parse.urlsplit(url)
         return f"{parts.scheme}://{parts.hostname}" if parts.hostname else "a URL" if url else ""
@@ -84,7 +84,7 @@ def stamp(now: datetime.datetime) -> str:
 
 def find_overdue(now: datetime.datetime, success: str, watch_h: float) -> str:
     """Why somebody should look: the last success is older than `watch_h` hours,
-    or lies in the future; empty where all is well."""
+    or lies in the future; empty if all is well."""
     if not success:
         return "no night has ever succeeded; run ./run beadline nightly, and look at its schedule"
     age_h = (now - datetime.datetime.fromisoformat(success)).total_seconds() / 3600

@@ -48,7 +48,7 @@ class TrainedClassifier(NamedTuple):
 
 
 def trained() -> TrainedClassifier:
-    """Raises ValueError, one sentence, where the stage has not run."""
+    """Raises ValueError, one sentence, if the stage has not run."""
     view = params.load(TrainClassifier, "train_classifier")
     model = restore_classifier(WEIGHTS, "datasets/train_classifier/calibration.parquet")
     return TrainedClassifier(model, artifacts.sha256(WEIGHTS), view)
@@ -56,8 +56,8 @@ def trained() -> TrainedClassifier:
 
 def ready(levels_file: str | None) -> Ready:
     """The default of evaluate_setpoint with the classifier of train_classifier, and the levels of this
-    camera: of `levels_file`, or where that is empty of LEVELS_FILE, if it is there; None for those that were
-    judged. Raises ValueError, one sentence, where a stage has not run."""
+    camera: of `levels_file`, or if that is empty of LEVELS_FILE, if it is there; None for those that were
+    judged. Raises ValueError, one sentence, if a stage has not run."""
     settings = params.load(EvaluateSetpoint, "evaluate_setpoint")
     model, digest, view = trained()
     name = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
@@ -121,7 +121,7 @@ def asked(flow: float, temperature: float | None, tip: str, *, once: bool, setti
 
 
 def bounded(flag: str, value: float) -> float:
-    """The value of a flag. Raises ValueError where it lies outside BOUNDS."""
+    """The value of a flag. Raises ValueError if it lies outside BOUNDS."""
     low, high = BOUNDS[flag]
     if not low <= value <= high:
         raise ValueError(

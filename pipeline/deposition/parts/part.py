@@ -101,7 +101,7 @@ def check_duration(moves: Moves, planned: Motion) -> None:
 
 def slowed_to(plan: Motion, moves: Moves) -> float | None:
     """mm/s^2 at which the printed moves change speed where that is less than the program's and the travel's
-    own; None where none is slowed down."""
+    own; None if none is slowed down."""
     own = np.fmin(moves.acceleration, plan.acceleration.max(initial=0.0))
     slowed = _prints(moves) & (plan.acceleration < own)
     return float(plan.acceleration[slowed].max()) if slowed.any() else None
