@@ -411,6 +411,14 @@ GROUPS = {
         "nightly": "Learn from new recordings and promote what is better",
     },
 }
+# command within a command -> its line there
+WITHIN = {
+    "experiment temperature": "Write an experiment for a machine without a recording",
+    "experiment setpoint": "Write a print that trains the nozzle camera",
+    "calibrate tip": "Show a picture on which a click gives the nozzle tip",
+    "calibrate camera": "Measure pixels and edges on lines of known widths",
+    "calibrate levels": "Correct the flow that another camera shows",
+}
 # exit status -> meaning and what to do
 STATUSES = {
     0: ("done", "nothing"),
@@ -420,6 +428,7 @@ STATUSES = {
 NIGHTLY_STATUSES = {
     0: ("promoted, kept, candidate stored, or nothing new", "nothing"),
     1: ("the run, the push, or the stages of one loop failed", "read the summary or reports/nightly.html"),
+    2: STATUSES[2],
     3: ("drift alarm", "look at the machine; that loop is not promoted while the alarm lasts"),
     4: ("done, but recordings were set aside", "repair them in datasets/quarantine and put them back"),
     75: ("another nightly run is at work", "wait for it"),
@@ -503,7 +512,7 @@ COMMANDS = {
                 dest="formats",
                 default="csv",
                 metavar="csv,parquet,mcap,gcode",
-                help="formats of the command; gcode is for machines that play no signal",
+                help="formats; gcode is for machines that play no signal",
             ),
             argument(
                 "--filament-mm", type=float, metavar="MM", help="diameter of what E pushes, if not stated"
@@ -557,7 +566,7 @@ COMMANDS = {
         shadow,
         "frames --once",
         (
-            argument("source", help="folder that fills, MCAP file that grows, or address of a snapshot"),
+            argument("source", help="folder that fills, growing MCAP file, or snapshot's address"),
             argument(
                 "--out", type=Path, default=Path("shadow"), metavar="DIR", help="for page and decisions"
             ),
@@ -614,7 +623,7 @@ COMMANDS = {
                 nargs="?",
                 const="",
                 metavar="LOOP/RUN",
-                help="back to the controller of RUN, else to the one before; of LOOP alone, if named",
+                help="back to the controllers of RUN, else to the one before",
             ),
             argument(
                 "--accept-drift", nargs=2, metavar=("LOOP", "WHY"), help="take the drift of LOOP as intended"
@@ -692,8 +701,8 @@ def parser() -> argparse.ArgumentParser:
             about = " ".join(str(COMMANDS[part].run.__doc__).split()).replace("%", "%%")
             command = inner.add_parser(
                 part.split()[-1],
-                help=about,
-                description=f"{_line(name)}.\n\n{textwrap.fill(about, 78)}",
+                help=_line(part),
+                description=f"{_line(part)}.\n\n{textwrap.fill(about, 78)}",
                 epilog=_ending(part),
             )
             for names, settings in COMMANDS[part].arguments:
@@ -703,7 +712,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _line(name: str) -> str:
-    return next(commands[name] for commands in GROUPS.values() if name in commands)
+    return next(lines[name] for lines in (*GROUPS.values(), WITHIN) if name in lines)
 
 
 def _ending(name: str) -> str:

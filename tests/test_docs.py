@@ -101,7 +101,10 @@ def beadline(monkeypatch, capsys):
     return run
 
 
-VERBS = {"Make", "Write", "List", "Compute", "Calibrate", "Watch", "Show", "Compare", "Learn"}
+VERBS = {
+    *("Make", "Write", "List", "Compute", "Calibrate", "Watch", "Show", "Compare", "Learn"),
+    *("Measure", "Correct"),
+}
 
 
 def test_help_has_twelve_commands_in_groups_and_each_line_begins_with_a_verb(beadline):
@@ -145,8 +148,17 @@ def test_the_help_of_a_command_has_an_example_exit_statuses_and_defaults(beadlin
 def test_the_help_of_a_command_of_several_parts_names_them_with_an_example(beadline, name):
     status, text, _ = beadline(name, "--help")
     assert status == 0 and f"Example: ./run beadline {name} " in text and "Exit status:\n  0   done" in text
-    listed = re.findall(r"^    (\w+)", text, re.MULTILINE)
-    assert listed == [part.split()[1] for part in cli.COMMANDS if part.startswith(f"{name} ")]
+    parts = [part for part in cli.COMMANDS if part.startswith(f"{name} ")]
+    lines = re.findall(r"^    (\w+) +(.+)$", text, re.MULTILINE)
+    assert lines == [(part.split()[1], cli.WITHIN[part]) for part in parts]
+    assert all(line.split()[0] in VERBS and len(line) <= 60 for _, line in lines)
+
+
+@pytest.mark.parametrize("name", list(cli.COMMANDS))
+def test_each_line_of_help_on_an_option_fits_beside_it(name):
+    for names, settings in cli.COMMANDS[name].arguments:
+        assert len(settings["help"].replace("%%", "%")) <= 60, names
+    assert {0, 1, 2} <= set(cli.COMMANDS[name].statuses)
 
 
 @pytest.mark.parametrize(
