@@ -64,7 +64,7 @@ def commands() -> str:
             usage = " ".join(command.format_usage().removeprefix("usage: ").split())
             parts += [
                 f"### {name}",
-                f"{lines[name.split()[0]]}. {about}",
+                f"{cli.WITHIN.get(name, lines[name.split()[0]])}. {about}",
                 f"```text\n{usage}\n```",
                 _options(command),
             ]

@@ -60,7 +60,7 @@ def accept(_: argparse.Namespace) -> None:
 
 
 def _today() -> dict[str, str]:
-    """The day, and the commit that is checked out; "none" where there is none."""
+    """The day, and the commit that is checked out; "none" if there is none."""
     head = subprocess.run(
         ["git", "rev-parse", "--short=8", "HEAD"], capture_output=True, text=True, check=False
     )
@@ -119,12 +119,16 @@ def inspect(arguments: argparse.Namespace) -> None:
     from pipeline.recordings.isolated import Budget, isolated
     from pipeline.recordings.plain_files import check_plain_file
 
-    here = Path(params.FILE) if Path(params.FILE).exists() else Path(__file__).parents[1] / params.FILE
-    declared = params.load(Ingest, "ingest", here)
+    declared = params.load(Ingest, "ingest", _settings_file())
     check_plain_file(arguments.file)
     budget = Budget(declared.longest_s, declared.largest_mb)
     form = as_json if arguments.json else describe
     print(printable(isolated(form, arguments.file, shown=arguments.file, budget=budget)))
+
+
+def _settings_file() -> Path:
+    """The parameters of this folder, or those beside the code: some commands need no project."""
+    return Path(params.FILE) if Path(params.FILE).exists() else Path(__file__).parents[1] / params.FILE
 
 
 def quick(_: argparse.Namespace) -> None:
@@ -173,12 +177,14 @@ def temperature_experiment(arguments: argparse.Namespace) -> None:
 
 def setpoint_experiment(arguments: argparse.Namespace) -> None:
     """The G-code of a print from which the classifier learns: one layer for each flow and temperature, with a
-    layer at 100 % between. A table beside it says which lines have which setting."""
+    layer at 100 % and the material's best temperature between. A table beside it says which lines have which
+    setting, and has the tip of params.yaml."""
     from pipeline.commands import training_print as printing
-    from pipeline.commands.shadow.deploy import pixel
+    from pipeline.setpoint.settings import SetpointMaterial, TrainClassifier
 
-    printed = printing.read(vars(arguments))
-    print(printing.write(printed, arguments.out, pixel(arguments.tip) if arguments.tip else None))
+    best = params.load(SetpointMaterial, "setpoint_material", _settings_file()).best_temperature_degC
+    tip_px = params.load(TrainClassifier, "train_classifier", _settings_file()).tip_px
+    print(printing.write(printing.read(vars(arguments), best), arguments.out, tip_px))
 
 
 def compose(arguments: argparse.Namespace) -> None:
@@ -195,9 +201,8 @@ def compose(arguments: argparse.Namespace) -> None:
             "which is made if it is missing"
         )
     request = command.request(
-        scale=arguments.scale, speed=arguments.speed, filament_mm=arguments.filament_mm,
-        extruder=arguments.extruder, bead=arguments.bead,
-    )  # fmt: skip
+        filament_mm=arguments.filament_mm, extruder=arguments.extruder, bead=arguments.bead
+    )
     formats, learned = command.formats(arguments.formats), command.read_learned()
     printer, settings = params.load(Printer, "printer"), params.load(ComposeParts, "compose_parts")
     part = compose_part(arguments.part, learned, printer, settings, **request)
@@ -227,7 +232,7 @@ def calibrate_tip(arguments: argparse.Namespace) -> None:
         ) from None
     topics = sections["train_classifier"].get("topics")
     topic = str(topics.get("image") or "") if isinstance(topics, dict) else ""
-    out = arguments.out or Path(f"{arguments.image.stem}.tip.html")
+    out = Path(f"{arguments.image.stem}.tip.html")
     print(calibrate(arguments.image, out, arguments.tip, least_score=least_score, topic=topic))
 
 
@@ -293,11 +298,12 @@ def calibrate_levels(arguments: argparse.Namespace) -> None:
     eye = deploy.trained()
     options, fitted = read_options(eye.view), eye.model.calibration
     material = params.load(SetpointMaterial, "setpoint_material").material()
+    hold_s = deploy.bounded("--hold", arguments.hold)
     protocol = levels.Protocol(
         numbers(arguments.flows, "--flows"),
-        deploy.bounded("--hold", arguments.hold),
-        deploy.bounded("--settle", arguments.settle),
-        deploy.bounded("--temperature", arguments.temperature),
+        hold_s,
+        levels.SETTLES * hold_s,
+        material.best_temperature_degC,
         deploy.pixel(arguments.tip) if arguments.tip else options.tip_px,
     )
     place = arguments.source
@@ -315,7 +321,7 @@ def export(arguments: argparse.Namespace) -> None:
     Kalico. The camera loop is exported as weights with readers that need NumPy alone."""
     from pipeline.commands.export import export as write
 
-    print(write(arguments.controller, arguments.to, arguments.out, arguments.section))
+    print(write(arguments.controller, arguments.to, arguments.out))
 
 
 def replay(arguments: argparse.Namespace) -> None:
@@ -327,8 +333,13 @@ def replay(arguments: argparse.Namespace) -> None:
     if exports.shows_frames(arguments.controller):
         from pipeline.commands import replay_camera
 
-        arguments.source, arguments.rate, arguments.once = str(arguments.recording), 5.0, True
-        _watch(arguments, replay_camera.ready(arguments.controller), in_json=arguments.json)
+        recorded = {"source": str(arguments.recording), "rate": 5.0, "once": True}
+        unrecorded = {"flow": 100.0, "temperature": None, "tip": ""}
+        _watch(
+            argparse.Namespace(**vars(arguments) | recorded | unrecorded),
+            replay_camera.ready(arguments.controller),
+            in_json=arguments.json,
+        )
         return
     from pipeline.commands import replay as replaying
     from pipeline.report.replay import page
@@ -400,6 +411,14 @@ GROUPS = {
         "nightly": "Learn from new recordings and promote what is better",
     },
 }
+# command within a command -> its line there
+WITHIN = {
+    "experiment temperature": "Write an experiment for a machine without a recording",
+    "experiment setpoint": "Write a print that trains the nozzle camera",
+    "calibrate tip": "Show a picture on which a click gives the nozzle tip",
+    "calibrate camera": "Measure pixels and edges on lines of known widths",
+    "calibrate levels": "Correct the flow that another camera shows",
+}
 # exit status -> meaning and what to do
 STATUSES = {
     0: ("done", "nothing"),
@@ -409,6 +428,7 @@ STATUSES = {
 NIGHTLY_STATUSES = {
     0: ("promoted, kept, candidate stored, or nothing new", "nothing"),
     1: ("the run, the push, or the stages of one loop failed", "read the summary or reports/nightly.html"),
+    2: STATUSES[2],
     3: ("drift alarm", "look at the machine; that loop is not promoted while the alarm lasts"),
     4: ("done, but recordings were set aside", "repair them in datasets/quarantine and put them back"),
     75: ("another nightly run is at work", "wait for it"),
@@ -431,8 +451,6 @@ def argument(*names: str, **settings: Any) -> tuple[tuple[str, ...], dict[str, A
 
 
 TIP = argument("--tip", default="", metavar="X,Y", help="nozzle tip in pixels of the pictures")
-FLOW = argument("--flow", type=float, default=100.0, help="flow setpoint in %% if the frames have none")
-NOZZLE = argument("--temperature", type=float, default=210.0, help="nozzle in °C if the frames have none")
 CONTROLLER = argument("controller", type=Path, metavar="CONTROLLER", help="folder of export_controllers")
 JSON = argument("--json", action="store_true", help="print JSON")
 COMMANDS = {
@@ -475,15 +493,12 @@ COMMANDS = {
             argument("--flows", default="40,60,75,85,92,100,108,115,125,150,200", help="flows in %%"),
             argument("--temperatures", default="190,200,210,220,230", help="nozzle temperatures in °C"),
             argument("--bed", default="220,220,250", metavar="MM,MM,MM", help="room along x, y and z"),
-            argument("--size", default="50,20", metavar="MM,MM", help="the cuboid along x and y"),
             argument("--nozzle", default="0.4", metavar="MM", help="its diameter; layers are half as high"),
             argument("--filament", default="1.75", metavar="MM", help="its diameter"),
             argument("--bed-temperature", default="60", metavar="DEGC", help="of the bed"),
-            argument("--best-temperature", default="210", metavar="DEGC", help="of the layers between"),
             argument(
                 "--melt", default="12", metavar="MM3/S", help="most that the hot end melts; limits speed"
             ),
-            TIP,
         ),
     ),
     "compose": Command(
@@ -497,10 +512,8 @@ COMMANDS = {
                 dest="formats",
                 default="csv",
                 metavar="csv,parquet,mcap,gcode",
-                help="formats of the command; gcode is for machines that play no signal",
+                help="formats; gcode is for machines that play no signal",
             ),
-            argument("--scale", type=float, default=1.0, help="X, Y and Z times this, and E's volume"),
-            argument("--speed", type=float, default=1.0, help="feeds times this"),
             argument(
                 "--filament-mm", type=float, metavar="MM", help="diameter of what E pushes, if not stated"
             ),
@@ -516,11 +529,7 @@ COMMANDS = {
     "calibrate tip": Command(
         calibrate_tip,
         "frame.png --tip 320,240",
-        (
-            argument("image", type=Path, help="a picture of the nozzle's camera"),
-            TIP,
-            argument("--out", type=Path, metavar="FILE", help="the page, else IMAGE.tip.html"),
-        ),
+        (argument("image", type=Path, help="a picture of the nozzle's camera"), TIP),
     ),
     "calibrate camera": Command(
         calibrate_camera,
@@ -543,9 +552,13 @@ COMMANDS = {
         (
             argument("source", type=Path, metavar="FOLDER|MCAP", help="pictures of the held flows"),
             argument("--flows", default="60,80,100,125,160", metavar="PERCENT,...", help="in their order"),
-            argument("--hold", type=float, default=60.0, metavar="S", help="how long each was held"),
-            argument("--settle", type=float, default=10.0, metavar="S", help="after each change, left out"),
-            NOZZLE,
+            argument(
+                "--hold",
+                type=float,
+                default=60.0,
+                metavar="S",
+                help="how long each was held; its first sixth is left out",
+            ),
             TIP,
         ),
     ),
@@ -553,13 +566,18 @@ COMMANDS = {
         shadow,
         "frames --once",
         (
-            argument("source", help="folder that fills, MCAP file that grows, or address of a snapshot"),
+            argument("source", help="folder that fills, growing MCAP file, or snapshot's address"),
             argument(
                 "--out", type=Path, default=Path("shadow"), metavar="DIR", help="for page and decisions"
             ),
             TIP,
-            FLOW,
-            NOZZLE,
+            argument("--flow", type=float, default=100.0, help="flow setpoint in %% if the frames have none"),
+            argument(
+                "--temperature",
+                type=float,
+                metavar="DEGC",
+                help="nozzle if the frames have none, else the best of params.yaml",
+            ),
             argument("--rate", type=float, default=5.0, metavar="HZ", help="snapshots a second"),
             argument("--once", action="store_true", help="end when the source ends"),
         ),
@@ -571,9 +589,6 @@ COMMANDS = {
             CONTROLLER,
             argument("--to", required=True, choices=("c", "python", "klipper"), help="the form"),
             argument("--out", type=Path, metavar="DIR", help="the folder, else CONTROLLER/FORM"),
-            argument(
-                "--section", default="extruder", choices=("extruder", "heater_bed"), help="of printer.cfg"
-            ),
         ),
     ),
     "replay": Command(
@@ -586,9 +601,6 @@ COMMANDS = {
             ),
             argument("--out", type=Path, default=Path("replay"), metavar="DIR", help="for page and signals"),
             argument("--reference", default="", metavar="DEGC,...", help="of each output, if not recorded"),
-            TIP,
-            FLOW,
-            NOZZLE,
             JSON,
         ),
     ),
@@ -610,13 +622,12 @@ COMMANDS = {
                 "--rollback",
                 nargs="?",
                 const="",
-                metavar="RUN",
-                help="put the controller of RUN, else the one before, back into production",
+                metavar="LOOP/RUN",
+                help="back to the controllers of RUN, else to the one before",
             ),
             argument(
                 "--accept-drift", nargs=2, metavar=("LOOP", "WHY"), help="take the drift of LOOP as intended"
             ),
-            argument("--loop", default="", help="with --rollback: only this loop"),
             argument("--dry-run", action="store_true", help="change nothing; print what would be done"),
         ),
         NIGHTLY_STATUSES,
@@ -690,8 +701,8 @@ def parser() -> argparse.ArgumentParser:
             about = " ".join(str(COMMANDS[part].run.__doc__).split()).replace("%", "%%")
             command = inner.add_parser(
                 part.split()[-1],
-                help=about,
-                description=f"{_line(name)}.\n\n{textwrap.fill(about, 78)}",
+                help=_line(part),
+                description=f"{_line(part)}.\n\n{textwrap.fill(about, 78)}",
                 epilog=_ending(part),
             )
             for names, settings in COMMANDS[part].arguments:
@@ -701,7 +712,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _line(name: str) -> str:
-    return next(commands[name] for commands in GROUPS.values() if name in commands)
+    return next(lines[name] for lines in (*GROUPS.values(), WITHIN) if name in lines)
 
 
 def _ending(name: str) -> str:

@@ -5,6 +5,7 @@ import contextlib
 import copy
 import importlib
 import os
+import resource
 import shutil
 import subprocess
 import time
@@ -194,7 +195,7 @@ def _furnish(folder: Path, files: Files, smaller: list[tuple[str, str, str]], ro
 
 def _copy_kept(folder: Path) -> str:
     """The kept artifacts in the places of their stages; the commit that they were made at. Raises ValueError
-    where one is missing or not as it was kept."""
+    if one is missing or not as it was kept."""
     index = KEPT / "kept.json"
     kept = artifacts.read_json(index) if artifacts.exists(index) else None
     if not isinstance(kept, dict) or not isinstance(kept.get("files"), dict):
@@ -212,7 +213,7 @@ def _copy_kept(folder: Path) -> str:
 
 def keep() -> str:
     """Puts the classifier of this checkout's full run into KEPT, in place of the one before. Raises
-    ValueError where there is none."""
+    ValueError if there is none."""
     folder = Path("datasets", TRAINED)
     if not artifacts.exists(folder / "weights.safetensors"):
         raise ValueError(f"{folder}: expected what training left, found none; ./run dvc repro {TRAINED}")
@@ -235,14 +236,44 @@ def keep() -> str:
 
 
 def _run(name: str, *, is_on: bool) -> tuple[str, float, float]:
-    """Runs one stage. Its name and its seconds, imports among them: on the wall, and of this process's CPU
-    (its workers' not among them)."""
-    wall, cpu = time.perf_counter(), time.process_time()
+    """Runs one stage. Its name and its seconds, imports among them: on the wall, and of the CPU, that of its
+    worker processes too."""
+    wall, cpu = time.perf_counter(), cpu_s()
     if is_on:
         importlib.import_module(f"stages.{name}").main()
     else:
         stages.leave_out(name)
-    return name, time.perf_counter() - wall, time.process_time() - cpu
+    return name, time.perf_counter() - wall, cpu_s() - cpu
+
+
+def cpu_s() -> float:
+    """CPU seconds of this process and of all processes below it: of those that were waited for, and, as
+    workers outlive the stage that they work for, of those that live or were killed and not waited for. If
+    the system has no /proc, the latter are missing."""
+    waited_for = resource.getrusage(resource.RUSAGE_CHILDREN)
+    ticks = sum(_ticks(pid) for pid in _children(os.getpid()))
+    own = time.process_time() + waited_for.ru_utime + waited_for.ru_stime
+    return own + ticks / os.sysconf("SC_CLK_TCK")
+
+
+def _children(pid: int) -> list[int]:
+    """The processes that `pid` started and has not waited for."""
+    pids: list[int] = []
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        with contextlib.suppress(OSError):  # the thread has ended
+            pids += map(int, task.read_text().split())
+    return pids
+
+
+def _ticks(pid: int) -> int:
+    """CPU of a process, of the children that it waited for, and of all processes below it, in clock ticks."""
+    below = sum(_ticks(child) for child in _children(pid))
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:  # it has ended
+        return below
+    # behind the name in brackets, which may hold blanks: utime, stime, cutime, cstime
+    return below + sum(map(int, stat.rpartition(")")[2].split()[11:15]))
 
 
 def summary(
@@ -253,10 +284,9 @@ def summary(
     sentences = [
         f"{loop}: {verdict['decision']} {verdict['lead']}".rstrip() for loop, verdict in verdicts.items()
     ]
+    whole = f"{'whole':<22}{whole_s:>7.1f} s {sum(cpu_s for _, _, cpu_s in rows):>7.1f} s CPU"
     page = f"{FOLDER}/reports/index.html"
-    return "\n".join(
-        [*lines, f"{'whole':<22}{whole_s:>7.1f} s", *sentences, f"{page}: a quick look, not a full run"]
-    )
+    return "\n".join([*lines, whole, *sentences, f"{page}: a quick look, not a full run"])
 
 
 if __name__ == "__main__":  # for makers: git keeps the classifier that a full run of this checkout trained

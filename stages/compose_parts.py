@@ -90,15 +90,13 @@ def compose_part(
     printer: Printer,
     settings: ComposeParts,
     *,
-    scale: float = 1.0,
-    speed: float = 1.0,
     filament_mm: float | None = None,
     extruder: str = "",
     declared_bead: bool = False,
 ) -> ComposedPart:
-    """A part program, composed: X, Y and Z `scale` times as large, feeds `speed` times as fast; with the
-    diameter of what E pushes, what drives the extrusion, and the declared bead instead of E, if a person
-    requests these. Raises ValueError naming the file, and the line if there is one."""
+    """A part program, composed; with the diameter of what E pushes, what drives the extrusion, and the
+    declared bead instead of E, if a person requests these. Raises ValueError naming the file, and the line if
+    there is one."""
     from pipeline.deposition.parts import extrusion, part
     from pipeline.recordings.part_files import read_part_program
 
@@ -110,11 +108,11 @@ def compose_part(
         )
     data = read_part_program(path)
     with artifacts.about(path):
-        program = part.parse(data, scale=scale, speed=speed, extruder=extruder)
+        program = part.parse(data, extruder=extruder)
         del data
         declared_mm = printer.filament_mm
         extruded = extrusion.wanted(
-            program, bead_area_mm2=printer.bead_area_mm2, asked_mm=filament_mm, scale=scale,
+            program, bead_area_mm2=printer.bead_area_mm2, asked_mm=filament_mm,
             declared_mm={one.tool: declared_mm for one in printer.materials if declared_mm is not None},
             declared_bead=declared_bead,
         )  # fmt: skip

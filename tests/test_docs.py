@@ -101,7 +101,10 @@ def beadline(monkeypatch, capsys):
     return run
 
 
-VERBS = {"Make", "Write", "List", "Compute", "Calibrate", "Watch", "Show", "Compare", "Learn"}
+VERBS = {
+    *("Make", "Write", "List", "Compute", "Calibrate", "Watch", "Show", "Compare", "Learn"),
+    *("Measure", "Correct"),
+}
 
 
 def test_help_has_twelve_commands_in_groups_and_each_line_begins_with_a_verb(beadline):
@@ -113,6 +116,16 @@ def test_help_has_twelve_commands_in_groups_and_each_line_begins_with_a_verb(bea
     assert status == 0
     for group, commands in cli.GROUPS.items():
         assert f"{group}:\n" + "\n".join(f"  {name:<12}{line}" for name, line in commands.items()) in text
+
+
+def test_all_commands_together_have_at_most_45_options():
+    options = [
+        (name, names[0])
+        for name, command in cli.COMMANDS.items()
+        for names, _ in command.arguments
+        if names[0].startswith("-")
+    ]
+    assert len(options) <= 45, options
 
 
 @pytest.mark.parametrize("name", list(cli.COMMANDS))
@@ -135,8 +148,17 @@ def test_the_help_of_a_command_has_an_example_exit_statuses_and_defaults(beadlin
 def test_the_help_of_a_command_of_several_parts_names_them_with_an_example(beadline, name):
     status, text, _ = beadline(name, "--help")
     assert status == 0 and f"Example: ./run beadline {name} " in text and "Exit status:\n  0   done" in text
-    listed = re.findall(r"^    (\w+)", text, re.MULTILINE)
-    assert listed == [part.split()[1] for part in cli.COMMANDS if part.startswith(f"{name} ")]
+    parts = [part for part in cli.COMMANDS if part.startswith(f"{name} ")]
+    listed = " ".join(f"{part.split()[1]} {cli.WITHIN[part]}" for part in parts)
+    assert f"WHAT {listed} options:" in " ".join(text.split())
+    assert all(cli.WITHIN[part].split()[0] in VERBS and len(cli.WITHIN[part]) <= 60 for part in parts)
+
+
+@pytest.mark.parametrize("name", list(cli.COMMANDS))
+def test_each_line_of_help_on_an_option_fits_beside_it(name):
+    for names, settings in cli.COMMANDS[name].arguments:
+        assert len(settings["help"].replace("%%", "%")) <= 60, names
+    assert {0, 1, 2} <= set(cli.COMMANDS[name].statuses)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +166,7 @@ def test_the_help_of_a_command_of_several_parts_names_them_with_an_example(beadl
     [
         (["inspct", "log.csv"], "inspect"), (["calibrate", "cam"], "camera"),
         (["init", "a.csv", "--coppy"], "--copy"),
-        (["nightly", "--roll-back"], "--rollback"), (["calibrate", "levels", "in", "--setle=3"], "--settle"),
+        (["nightly", "--roll-back"], "--rollback"), (["calibrate", "levels", "in", "--hodl=3"], "--hold"),
     ],
 )  # fmt: skip
 def test_a_mistyped_command_or_option_is_answered_with_the_closest_one(beadline, typed, meant):

@@ -8,8 +8,10 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
+import joblib
 import pytest
 import yaml
 
@@ -20,7 +22,8 @@ from pipeline.setpoint.frames.files import CAMERA_FILE, restore_camera
 from pipeline.setpoint.simulation.recorded import window_tables
 from pipeline.setpoint.tables import WINDOW_PARTS, WINDOWS
 from pipeline.setpoint.vision.files import restore_classifier
-from pipeline.store import artifacts, params
+from pipeline.store import artifacts, execution, params
+from pipeline.store.params import Execution
 from pipeline.verdict.settings import QUICK_LOOK
 from pipeline.verdict.verdict import words_for
 
@@ -111,6 +114,59 @@ def test_the_same_inputs_give_the_same_bytes_and_take_the_place_of_the_last(look
     (folder / "quick/left.txt").write_text("of the last quick look")
     quick.quick()
     assert written(folder / "quick") == before
+
+
+# ---- CPU seconds
+
+BURN = """
+import time
+begun = time.process_time()
+while time.process_time() < begun + 0.5: pass
+print(flush=True)
+"""
+# how a stage leaves a worker that has taken half a second: a line of the worker, and what the stage does
+WORKERS = {
+    "it lives on": ("time.sleep(60)", lambda worker: None),
+    "it ended and nobody waited": ("", lambda worker: None),
+    "it was killed and nobody waited": ("time.sleep(60)", lambda worker: os.kill(worker.pid, signal.SIGKILL)),
+    "it was killed and waited for": ("time.sleep(60)", lambda worker: (worker.kill(), worker.wait())),
+    "it has a worker of its own": (
+        "import subprocess, sys\n"
+        f"subprocess.run([sys.executable, '-c', {BURN!r}])\nprint(flush=True)\ntime.sleep(60)",
+        lambda worker: worker.stdout.readline(),
+    ),
+}
+
+
+@pytest.mark.parametrize("left", WORKERS)
+def test_the_cpu_of_a_stage_is_that_of_its_workers_too(monkeypatch, left):
+    last, leave = WORKERS[left]
+    workers = []
+
+    def main() -> None:
+        worker = subprocess.Popen([sys.executable, "-c", BURN + last], stdout=subprocess.PIPE)
+        workers.append(worker)
+        worker.stdout.readline()
+        leave(worker)
+
+    monkeypatch.setitem(sys.modules, "stages.toy", types.SimpleNamespace(main=main))
+    _, _, cpu_s = quick._run("toy", is_on=True)
+    _, _, next_s = quick._run("toy", is_on=True)
+    for worker in workers:
+        worker.kill()
+        worker.communicate()
+    taken = 1.0 if "own" in left else 0.5
+    assert taken - 0.1 < cpu_s < taken + 0.4 and taken - 0.1 < next_s < taken + 0.4, "once, and no more"
+
+
+def test_the_cpu_of_joblib_s_workers_counts_for_the_stage_that_they_work_for(monkeypatch):
+    two = Execution(backend="loky", jobs=2, scheduler="")
+
+    def main() -> None:
+        assert len(list(execution.run_all(2 * [joblib.delayed(exec)(BURN)], two))) == 2
+
+    monkeypatch.setitem(sys.modules, "stages.toy", types.SimpleNamespace(main=main))
+    assert quick._run("toy", is_on=True)[2] > 0.8
 
 
 # ---- one that does not end

@@ -19,6 +19,7 @@ from pipeline.store import artifacts
 from pipeline.store.tables import FLOAT, Column, Schema
 
 FORMATS = ("csv", "parquet", "mcap", "gcode")
+WIDEST_MM = 200.0  # of a filament or plunger
 
 
 def read_learned() -> LearnedLibrary:
@@ -38,21 +39,15 @@ def formats(text: str) -> tuple[str, ...]:
     return names
 
 
-def request(
-    *, scale: float, speed: float, filament_mm: float | None, extruder: str, bead: str
-) -> dict[str, Any]:
+def request(*, filament_mm: float | None, extruder: str, bead: str) -> dict[str, Any]:
     """What a person requests on the command line: keywords of `compose_parts.compose_part`. Raises ValueError
     naming the flag."""
-    for flag, value, most in (
-        ("--scale", scale, 1e3),
-        ("--speed", speed, 1e3),
-        ("--filament-mm", filament_mm, 200),
-    ):
-        if value is not None and not 0 < value <= most:
-            raise ValueError(f"{flag}: expected a number above 0, at most {most:g}, found {value:g}")
+    if filament_mm is not None and not 0 < filament_mm <= WIDEST_MM:
+        raise ValueError(
+            f"--filament-mm: expected a number above 0, at most {WIDEST_MM:g}, found {filament_mm:g}; "
+            "write the diameter in mm"
+        )
     return {
-        "scale": scale,
-        "speed": speed,
         "filament_mm": filament_mm,
         "extruder": extruder.strip().upper(),
         "declared_bead": bead == "declared",

@@ -1,6 +1,7 @@
 """`beadline export`: a certified controller in the form that a machine can run, or what sees and decides in
 the setpoint loop. The stage export_controllers writes the same files."""
 
+import re
 from pathlib import Path
 
 from pipeline.deploy import certificate, machine, to_c, to_klipper, to_python, to_setpoint, vectors
@@ -40,6 +41,7 @@ Copy this there
     cp beadline.cfg CONFIG/
     sed -i '1i [include beadline.cfg]' CONFIG/printer.cfg
     Restart Klipper: sudo systemctl restart klipper
+    beadline.cfg names the heater that it controls, extruder or heater_bed: correct that line if it is wrong.
 
 Go back
     sed -i '/^\\[include beadline.cfg\\]$/d' CONFIG/printer.cfg
@@ -51,30 +53,37 @@ KLIPPER is the folder of Klipper (often ~/klipper), CONFIG that of printer.cfg (
 }
 
 
-def files(made: Exported, shown: Certificate, to: str, section: str) -> dict[str, str]:
-    """The files of one form, name to text. Raises ValueError, naming what is missing, where the machine or
+def files(made: Exported, shown: Certificate, to: str) -> dict[str, str]:
+    """The files of one form, name to text. Raises ValueError, naming what is missing, if the machine or
     the certificate does not allow it."""
     if to == "c":
         texts = to_c.files(made, shown, vectors.golden(made))
         return texts | {"README.txt": f"{texts['README.txt']}\n{PLACING[to]}"}
     if to == "python":
         return {"controller.py": to_python.text(made, shown), "README.txt": PLACING[to]}
-    section_text = to_klipper.settings(made, shown, section=section)
+    section_text = to_klipper.settings(made, shown, section=klipper_section(made))
     return {to_klipper.FILE: section_text, **to_klipper.module(made, shown), "README.txt": PLACING[to]}
 
 
-def export(folder: Path, to: str, out: Path | None, section: str) -> str:
+def klipper_section(made: Exported) -> str:
+    """The heater's section of printer.cfg: that of the bed if a signal is called after the bed, as `init`
+    names them (heater_bed.pwm), else that of the extruder."""
+    names = (one.name.casefold() for one in (*made.machine.inputs, *made.machine.outputs))
+    extruder, bed = to_klipper.SECTIONS
+    return bed if any("bed" in re.split(r"[^a-z]+", name) for name in names) else extruder
+
+
+def export(folder: Path, to: str, out: Path | None) -> str:
     """Writes the files of one form, and says which and of what."""
     target = folder / to if out is None else out
     if target.exists() and not target.is_dir():
         raise ValueError(
-            f"--out {target}: should be a folder but is a file; name a folder, which is made where it is "
-            "missing"
+            f"--out {target}: should be a folder but is a file; name a folder, which is made if it is missing"
         )
     if shows_frames(folder):
         return _export_readers(folder, to, target)
     made, shown = machine.read(folder)
-    texts = files(made, shown, to, section)
+    texts = files(made, shown, to)
     with artifacts.together(target) as place:
         for name, text in texts.items():
             artifacts.write_text(place / name, text)

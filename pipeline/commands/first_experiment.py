@@ -192,7 +192,7 @@ def instructions(plan: Staircase, file: str) -> str:
         f"Stop at: {stops}. When one is reached, set every input to its level of step 1, wait until the "
         "machine has cooled, and go on with the next input.",
         f"Record every input and every temperature all the time. Hold each step for {plan.hold_s:g} s, or "
-        "shorter where no temperature moves any more.",
+        "shorter if no temperature moves any more.",
     ]
     for k, (moves, levels) in enumerate(plan.steps, 1):
         if moves:

@@ -16,7 +16,7 @@ SCHEMA = ("levels", 1)
 
 class RecordedLevels(NamedTuple):
     """The correction, the windows that it was fitted on, the digest of the classifier's weights that showed
-    them (of another classifier it says nothing); how this camera looks, None where there were too few windows
+    them (of another classifier it says nothing); how this camera looks, None if there were too few windows
     to know it by, and the distance above which a frame of it is foreign."""
 
     levels: Levels
@@ -27,7 +27,7 @@ class RecordedLevels(NamedTuple):
 
 
 def store_levels(path: str | Path, recorded: RecordedLevels) -> None:
-    """Raises OSError, one sentence, where it cannot be written."""
+    """Raises OSError, one sentence, if it cannot be written."""
     fitted, windows = recorded.levels, recorded.windows
     digest = np.frombuffer(bytes.fromhex(recorded.weights), np.uint8)
     camera = recorded.camera or KnownCamera(*(np.zeros(0) for _ in KnownCamera._fields))
@@ -65,7 +65,7 @@ def store_levels(path: str | Path, recorded: RecordedLevels) -> None:
 
 
 def restore_levels(path: str | Path, weights: str) -> RecordedLevels:
-    """What `store_levels` wrote. Raises ValueError where it is of another classifier than that with the
+    """What `store_levels` wrote. Raises ValueError if it is of another classifier than that with the
     digest `weights`, or is no such file."""
     found = artifacts.read_arrays(path, *SCHEMA)
     digest = found["weights"].astype(np.uint8).tobytes().hex()

@@ -291,7 +291,7 @@ def _open_questions(proposal: Proposal, scale: MachinePace, kind: str, *, timed:
     questions.append(f"plant.outputs reference, where each should settle: now {', '.join(references)} °C")
     questions.append(
         "generate_probing: whether the machine may be moved so; the next experiment switches each input "
-        "by at most amplitude_percent, and is written only where its forecast stays within low and high"
+        "by at most amplitude_percent, and is written only if its forecast stays within low and high"
     )
     paces = [f"{name} {float(f'{tau:.2g}'):g} s" for name, tau in scale.time_constants_s.items()]
     questions.append(f"report: whether the rules suit you; the time constants are {', '.join(paces)}")

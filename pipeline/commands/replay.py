@@ -1,5 +1,5 @@
 """`beadline replay`: a recording, and what a certified controller would have asked on it, sample by sample,
-and why not; where the recording is off the support of what was learned, it says nothing."""
+and why not; if the recording is off the support of what was learned, it says nothing."""
 
 import math
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ STRETCH = 1_000
 class ReplayedRecording(NamedTuple):
     """One recording replayed. By sample: time_s (T,), applied, wished, asked (T, m), why (T, m) of
     replay.WHY, measured, reference, target (T, p), off (T,) of support, cause (T,) of supervise.KINDS or -1.
-    `abstains` where the recording is off support; `told` are sentences."""
+    `abstains` if the recording is off support; `told` are sentences."""
 
     time_s: np.ndarray
     applied: np.ndarray
@@ -65,7 +65,7 @@ HOTTEST_DEGC = 2000.0
 
 
 def recorded(path: Path, made: Exported) -> tuple[Table, str]:
-    """The recording on the controller's sample time, with disturbances and `<output> reference` where it has
+    """The recording on the controller's sample time, with disturbances and `<output> reference` if it has
     them, and which columns references were. Raises ValueError naming a signal that is missing."""
     wired = made.machine
     sources, settings, time = _sources(made, [*wired.inputs, *wired.outputs])
@@ -99,7 +99,7 @@ def _reference(source: Source, ending: str) -> Source:
 
 
 def _sources(made: Exported, signals: Sequence[Signal]) -> tuple[list[Source], str, str]:
-    """Where a recording has these signals: as ingest.mapping says where params.yaml is of this
+    """Where a recording has these signals: as ingest.mapping says if params.yaml is of this
     machine, otherwise under their own names; the decimal mark and the clock."""
     plain = [Source(one.name, one.name, one.unit) for one in signals]
     if not Path(params.FILE).exists():
@@ -201,7 +201,7 @@ def _check_log(
 
 
 def _filled(values: np.ndarray) -> np.ndarray:
-    """The last number that there was; before the first the first. Raises ValueError where there is none."""
+    """The last number that there was; before the first the first. Raises ValueError if there is none."""
     missing = ~np.isfinite(values)
     if not missing.any():
         return values
@@ -274,7 +274,7 @@ def summary(done: ReplayedRecording, made: Exported, path: Path) -> dict[str, An
 
 
 def signals(done: ReplayedRecording, made: Exported) -> dict[str, tuple[np.ndarray, str, str]]:
-    """The columns of replay.mcap; where the replay abstains, what was asked is what was applied."""
+    """The columns of replay.mcap; if the replay abstains, what was asked is what was applied."""
     columns: dict[str, tuple[np.ndarray, str, str]] = {}
     asked = done.applied if done.abstains else done.asked
     for i, one in enumerate(made.machine.inputs):

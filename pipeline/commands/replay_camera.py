@@ -1,4 +1,4 @@
-"""`beadline replay` of recorded frames: the loop of `beadline shadow`, where CONTROLLER's folder holds the
+"""`beadline replay` of recorded frames: the loop of `beadline shadow`, if CONTROLLER's folder holds the
 classifier and the filter that evaluate_setpoint judged."""
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from pipeline.store import artifacts
 
 def ready(folder: Path) -> deploy.Ready:
     """The loop that evaluate_setpoint judged, without the levels of a camera, which were not exported. Raises
-    ValueError where the folder's numbers are others, and where a stage has not run."""
+    ValueError if the folder's numbers are others, and if a stage has not run."""
     judged = deploy.ready(None)
     name, decides = judged.deployed.name, judged.deployed.parameters
     if not isinstance(decides, FlowFilter):

@@ -21,12 +21,14 @@ from pipeline.store import artifacts
 # least and largest of each flag, with its unit
 BOUNDS = {
     "--bed": (10.0, 2000.0, "mm"), "--nozzle": (0.1, 2.0, "mm"), "--filament": (1.0, 3.5, "mm"),
-    "--size": (10.0, 500.0, "mm"), "--bed-temperature": (0.0, 150.0, "degC"),
-    "--best-temperature": (150.0, 320.0, "degC"), "--temperatures": (150.0, 320.0, "degC"),
-    "--flows": (*FLOW_LIMITS, "percent"), "--melt": (0.5, 200.0, "mm^3/s"),
+    "--bed-temperature": (0.0, 150.0, "degC"),
+    "--temperatures": (150.0, 320.0, "degC"), "--flows": (*FLOW_LIMITS, "percent"),
+    "--melt": (0.5, 200.0, "mm^3/s"),
 }  # fmt: skip
 # how many numbers a flag takes; one if it does not stand here, 0: any
-COUNTS = {"--bed": 3, "--size": 2, "--flows": 0, "--temperatures": 0}
+COUNTS = {"--bed": 3, "--flows": 0, "--temperatures": 0}
+# mm along x and y of the cuboid, if the bed has room for it, and the least of which anything can be seen
+CUBOID, LEAST = (50.0, 20.0), 10.0
 # mm/s of lines, if the hot end melts as much, and between them; height of a layer as a share of the nozzle
 SPEED, TRAVEL, LAYER = 20.0, 100.0, 0.5
 # of the lines: wider than the nozzle by this; layers of ground below the first setting; mm from the bed's
@@ -34,6 +36,8 @@ SPEED, TRAVEL, LAYER = 20.0, 100.0, 0.5
 WIDER, GROUND, MARGIN = 1.2, 2, 5.0
 # the nozzle waits for its temperature so far beside the part and above it
 ASIDE, LIFT = 12.0, 2.0
+# mm of the bed that are not the cuboid's
+ROOM = 2 * (ASIDE + 2 * MARGIN)
 RETRACT, LIFT_SPEED = 1.0, 10.0
 MOST_SETTINGS = 400
 COLUMNS = (
@@ -81,7 +85,7 @@ class PrintProgram(NamedTuple):
 
 
 def numbers(text: str, flag: str, count: int = 0) -> tuple[float, ...]:
-    """The numbers of a flag, such as 60,80,100, each within its bounds; as many as `count`, where not 0."""
+    """The numbers of a flag, such as 60,80,100, each within its bounds; as many as `count`, if not 0."""
     low, high, unit = BOUNDS[flag]
     try:
         values = tuple(float(part) for part in text.split(","))
@@ -96,20 +100,20 @@ def numbers(text: str, flag: str, count: int = 0) -> tuple[float, ...]:
     return values
 
 
-def read(options: Mapping[str, object]) -> TrainingPrint:
-    """The print that the command's options ask for, each a text. The lines are as fast as the hot end melts
-    at the largest flow. Raises ValueError, one sentence, for an option outside its bounds."""
+def read(options: Mapping[str, object], best_temperature: float) -> TrainingPrint:
+    """The print that the command's options ask for, each a text, and the material's best temperature in degC.
+    The lines are as fast as the hot end melts at the largest flow. Raises ValueError, one sentence, for an
+    option outside its bounds."""
     found = {
         flag: numbers(str(options[flag[2:].replace("-", "_")]), flag, COUNTS.get(flag, 1)) for flag in BOUNDS
     }
     x, y, height = found["--bed"]
-    across, along = found["--size"]
     (nozzle,), (filament,), (melt,) = found["--nozzle"], found["--filament"], found["--melt"]
-    (bed,), (best,) = found["--bed-temperature"], found["--best-temperature"]
+    (bed,) = found["--bed-temperature"]
     asked = TrainingPrint(
         flows=found["--flows"], temperatures=found["--temperatures"], bed=(x, y), height=height,
-        size=(across, along), nozzle=nozzle, layer=LAYER * nozzle, filament=filament, speed=SPEED,
-        travel=TRAVEL, bed_temperature=bed, best_temperature=best,
+        size=(min(CUBOID[0], x - ROOM), min(CUBOID[1], y - ROOM)), nozzle=nozzle, layer=LAYER * nozzle,
+        filament=filament, speed=SPEED, travel=TRAVEL, bed_temperature=bed, best_temperature=best_temperature,
     )  # fmt: skip
     most = melt / (_line_area(asked) * max(*asked.flows, 100.0) / 100.0)
     return asked._replace(speed=min(SPEED, most))
@@ -125,10 +129,10 @@ def check(asked: TrainingPrint) -> None:
     if count > MOST_SETTINGS:
         raise ValueError(f"expected at most {MOST_SETTINGS} settings, found {count}; print in two parts")
     for axis, size, bed in zip("xy", asked.size, asked.bed, strict=True):
-        if size + 2 * (ASIDE + 2 * MARGIN) > bed:
+        if size < LEAST:
             raise ValueError(
-                f"--size: {size:g} mm along {axis} need a bed of {size + 2 * (ASIDE + 2 * MARGIN):g} mm with "
-                f"the nozzle's place to wait, found --bed {bed:g}; print a smaller cuboid"
+                f"--bed: expected at least {LEAST + ROOM:g} mm along {axis}, for a cuboid of {LEAST:g} mm "
+                f"and the nozzle's place to wait, found {bed:g}; print on a larger bed"
             )
     top = _tops(asked)[-1] + LIFT
     if top > asked.height:
@@ -242,7 +246,7 @@ def _raster(asked: TrainingPrint, z: float, flow: float, *, along_x: bool) -> tu
 
 
 def _heat(asked: TrainingPrint, before: PrintLayer | None, temperature: float, z: float) -> list[str]:
-    """Where the temperature of a layer is another one, the nozzle waits for it beside the part; R waits for
+    """If the temperature of a layer is another one, the nozzle waits for it beside the part; R waits for
     cooling too."""
     if before is not None and before.temperature == temperature:
         return []

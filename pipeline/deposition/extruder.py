@@ -124,7 +124,7 @@ def routine(
     """Off, on, pause, on, off: r = bead area x speed while printing. `speed` in mm/s; the gantry changes it
     in gantry_ramp_s, evenly, and two boxes of `ramp_s` shape every change beside.
 
-    Raises ValueError where a ramp does not fit before the start or after the
+    Raises ValueError if a ramp does not fit before the start or after the
     stop; ramps longer than the pause leave a dip of it.
     """
     shortest, before = min(off_s, tail_s), ramp_s + gantry_ramp_s / 2

@@ -220,7 +220,7 @@ class Camera(Section):
         if abs(self.mm_per_px) < 1e-6:
             raise ValueError(
                 f"has mm_per_px {self.mm_per_px:g}; give the size of a pixel on the stage, "
-                "negative where the line trails to higher columns"
+                "negative if the line trails to higher columns"
             )
         if self.columns[1] <= self.columns[0]:
             raise ValueError(
@@ -230,7 +230,7 @@ class Camera(Section):
         if self.edge_bias_px and len(self.edge_bias_px) != len(self.known_widths_mm):
             raise ValueError(
                 f"has {len(self.edge_bias_px)} edge_bias_px for {len(self.known_widths_mm)} known_widths_mm; "
-                "give one each, or [] where the camera is not calibrated"
+                "give one each, or [] if the camera is not calibrated"
             )
         if any(
             wider <= width

@@ -12,6 +12,14 @@ from pipeline.nightly.worktree import COPY, Snapshot
 from pipeline.store import artifacts, params
 
 
+def named(word: str) -> tuple[str, str]:
+    """(run, loop), each "" if it is not named, of RUN, LOOP, LOOP/RUN or the tag production/LOOP/RUN."""
+    loop, slash, run = word.removeprefix("production/").rpartition("/")
+    if not slash and run in champion.read().champions:
+        return "", run
+    return run, loop
+
+
 def rollback(run: str, loop: str, *, dry_run: bool = False) -> str:
     """Puts the identical champion of an earlier run back into production, and returns what was done. With
     `dry_run`, returns what would be done and changes nothing."""

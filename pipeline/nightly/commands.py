@@ -15,7 +15,7 @@ def run(arguments: argparse.Namespace, render: "Render") -> tuple[int, str]:
     if arguments.accept_drift:
         return 0, by_hand.accept(*arguments.accept_drift)
     if arguments.rollback is not None:
-        return 0, by_hand.rollback(arguments.rollback, arguments.loop, dry_run=arguments.dry_run)
+        return 0, by_hand.rollback(*by_hand.named(arguments.rollback), dry_run=arguments.dry_run)
     if arguments.dry_run:
         return 0, night.preview()
     return reporting.watchdog() if arguments.watch else night.nightly(render)

@@ -35,7 +35,7 @@ def repair(path: Path, group: FileColumns, *, may_restart: bool) -> Repaired:
     each are spread evenly. A few late rows are sorted back. Of rows with one time the first stays: exact
     repeats are dropped, and a few others.
 
-    Raises ValueError with the place where that is not enough.
+    Raises ValueError with the place if that is not enough.
     """
     time = group.time
     if len(time) < 2 or (time[1:] > time[:-1]).all() or not np.isfinite(time).all():

@@ -405,6 +405,9 @@ def sound_rows(
         notes.append(Note("header", "", len(repeated), message))
     if len(tail) == 1 and len(tail[0][1]) < width:
         notes.append(Note("truncated", "", 1, _BROKEN_OFF.format(tail[0][0], len(tail[0][1]), width)))
+    elif len(tail) == 1 and len(tail[0][1]) > width:
+        message = f"{_unsound(*tail[0], layout, clock)}; it is the last and was left out"
+        notes.append(Note("trailing", "", 1, message))
     elif tail:
         line, row = tail[0]
         message = f"{len(tail)} lines behind the data were left out, from line {line} on, which is "
@@ -550,7 +553,7 @@ def _first_row(
     path: Path, rows: Sequence[list[str]], numbers: Sequence[int], comment: Sequence[bool], delimiter: str
 ) -> tuple[int, int]:
     """(index, width) of the first row of the table. It stands behind the first line that names a time, if
-    there is one, and has the width of most rows with numbers."""
+    there is one, and has the width of most rows with numbers; of equally many, that of the names above."""
     header = next((i for i, row in enumerate(rows) if _names_time(row) and any(numbers[i + 1 :])), -1)
     data = [i for i in range(header + 1, len(rows)) if numbers[i]]
     if not data:
@@ -563,7 +566,8 @@ def _first_row(
             "record it again or remove it"
         )
     widths = collections.Counter(len(rows[i]) for i in data)
-    width = max(widths, key=lambda count: (widths[count], count))
+    named = _named_columns(rows[: data[0]], numbers)
+    width = max(widths, key=lambda count: (widths[count], count == named, count))
     table = [i for i in data if len(rows[i]) == width]
     written = [i for i in range(table[0], len(rows)) if any(rows[i]) and not comment[i]]
     # a language has words and lines of all lengths, with a number here and there
@@ -579,7 +583,16 @@ def _first_row(
     widths_above = {width + 1} | ({width - 1} if header >= 0 and len(rows[header]) == width else set())
     while begin - 1 in data and len(rows[begin - 1]) in widths_above:
         begin -= 1
-    return begin, max(width, len(rows[begin]))
+    if len(data) == 1 and _names_time(rows[begin - 1]) and named < width:
+        width = named
+    # a row that is wider than its header takes no names from it: it is refused, or left out, with its line
+    return begin, width if width == named else max(width, len(rows[begin]))
+
+
+def _named_columns(above: Sequence[list[str]], numbers: Sequence[int]) -> int:
+    """How many columns the last written line above the data names, 0 for none."""
+    written = [i for i, row in enumerate(above) if any(row)]
+    return len(above[written[-1]]) if written and not numbers[written[-1]] else 0
 
 
 # ---- rows of plain numbers by Arrow, which reads only what the slow way reads in the same manner
@@ -1006,9 +1019,11 @@ def _read_one_clock(
         place = _place(lines)
     count = len(next(iter(values.values())))
     if not count:
+        first = next(rows(path, layout), None)
+        why = f" ({_unsound(*first, layout, column)})" if first else ""
         raise ValueError(
             f"{path}: no row behind line {layout.skip} has a time and the {len(layout.names)} fields of the "
-            "header; mend the rows, or record it again"
+            f"header{why}; mend the rows, or record it again"
         )
     if column is None:
         times, zone = np.arange(count) * (interval or 0.0), ""

@@ -26,7 +26,7 @@ Exclusion = dict[str, str]
 
 
 def read_list(folder: str | Path) -> dict[str, Exclusion]:
-    """{path below the folder: exclusion}; empty where there is no list. Raises ValueError where the list
+    """{path below the folder: exclusion}; empty where there is no list. Raises ValueError if the list
     cannot be read."""
     path = Path(folder) / FILE
     try:
@@ -36,7 +36,7 @@ def read_list(folder: str | Path) -> dict[str, Exclusion]:
 
 
 def parse(text: str) -> dict[str, Exclusion]:
-    """The entries of a list. Raises ValueError where the text is none."""
+    """The entries of a list. Raises ValueError if the text is none."""
     try:
         entries = yaml.safe_load(text) or {}
         return {str(name): {key: str(e[key]) for key in ("sha256", "reason")} for name, e in entries.items()}

@@ -530,7 +530,7 @@ MOST_VALUES = 100_000_000
 class WholeTable(NamedTuple):
     """Numbers of n rows by name, with the unit that the file gives ("" for none).
 
-    `time` is the file's own clock, time_s (n,) or time_ns (n,) on a calendar, None where a column holds it.
+    `time` is the file's own clock, time_s (n,) or time_ns (n,) on a calendar, None if a column holds it.
     `limits` are the lowest and highest value that the machine's own settings allow, by column.
     `texts` are the columns that are no numbers, with what they hold.
     """

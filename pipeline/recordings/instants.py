@@ -164,7 +164,7 @@ def month_first(dates: Iterable[str], sample: str) -> bool | None:
 
 def steady_order(stamps: Iterable[str]) -> bool | None:
     """Whether the month stands first in dates that can be both, by the one reading that runs forward in
-    steps that are nearly equal; None where neither does or both do.
+    steps that are nearly equal; None if neither does or both do.
 
     Steps count where the date changes, and at the first stamps. Text that is no time is passed over.
     """

@@ -66,7 +66,7 @@ REMEDIES = {
     NO_FLOW: "fill it in, in percent of nominal, or remove those lines",
     NO_TEMPERATURE: "fill it in, or remove those lines; without a column target_hotend "
     "the measured hotend is taken",
-    NO_PRINT: "fill in print_id, or remove that column where the file is one print",
+    NO_PRINT: "fill in print_id, or remove that column if the file is one print",
     NO_NAME: "fill in img_path, or remove those lines",
     REPEATED: "remove the lines that repeat others",
     COPY: "record again with a camera that runs, or remove the copies",
@@ -82,7 +82,7 @@ OPTIONAL = {
     "print_id": "the file is one print",
     "nozzle_tip_x": "the tip is that of the settings",
     "timestamp": "the order of the rows is not checked",
-    DIRECTION: "the travel direction is that of the ground, where it is seen to move, or of the only line",
+    DIRECTION: "the travel direction is that of the ground, if it is seen to move, or of the only line",
 }
 # beside flow and target temperature, what is constant within a segment where the file has it
 SETTINGS = ("feed_rate", "z_offset")
@@ -211,7 +211,7 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution) -> Noz
 
     Images are looked for beside their CSV and from `folder` on, with the path as written or without its first
     folders. Raises ValueError, one sentence, for what read_log and read_recording refuse, for two lines that
-    contradict one another about an image, and where no frame at all shows a line.
+    contradict one another about an image, and if no frame at all shows a line.
     """
     names = _images(folder)
     files = {
@@ -278,7 +278,7 @@ def _crops(log: FrameLog, folder: Path, images: list[str], problems: list[str], 
 
 
 def check(folder: Path, frames: NozzleFrames) -> None:
-    """Raises ValueError where nothing can be learned from the valid frames, or not be
+    """Raises ValueError if nothing can be learned from the valid frames, or not be
     judged: one print only, or a class without a frame."""
     prints = np.unique(frames.print_number[frames.valid])
     if len(prints) < 2:
@@ -418,7 +418,7 @@ def _image_paths(log: FrameLog, folder: Path, files: set[str]) -> tuple[list[str
 
 def _line_problems(logs: Sequence[FrameLog], images: Sequence[list[str]]) -> list[list[str]]:
     """Why a line cannot be learned from, before any image is opened. Raises
-    ValueError where two lines contradict one another."""
+    ValueError if two lines contradict one another."""
     first: dict[str, tuple[int, int]] = {}
     reasons = []
     for k, (log, paths) in enumerate(zip(logs, images, strict=True)):
@@ -651,7 +651,7 @@ def read_recording(
     memory at a time; `shown` is the path that is spoken of.
 
     The tip is `tip_px` or, where that is None, the recording's; the print is the recording's print_id, or its
-    file. Raises ValueError, one sentence, where the file cannot be read, has no such topic, or has frames and
+    file. Raises ValueError, one sentence, if the file cannot be read, has no such topic, or has frames and
     setpoints that do not overlap in time; what is damaged is left out and noted.
     """
     try:
@@ -736,7 +736,7 @@ def _read_recording(
     else:
         sentence = (
             "its temperature changes all the time, so it is measured and ends no segment; "
-            "map the setpoint where there is one"
+            "map the setpoint if there is one"
         )
         notes.append(Note("temperature", "temperature_degC", 1, sentence))
     reasons = areas.reasons

@@ -299,7 +299,7 @@ def _remembered(
     memo: Path, key: str, wish: RecordingWish
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]] | None:
     """Record and quality of an entry whose digests, written last, are those of its files;
-    None where it is absent, half written or damaged."""
+    None if it is absent, half written or damaged."""
     try:
         if artifacts.read_json(memo / f"{key}.json") != _digests(memo, key):
             return None

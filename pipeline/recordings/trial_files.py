@@ -334,7 +334,7 @@ def read_trial(
 
     `image` names the image topic, by default the only one; `time` the clock: log_time (the default),
     publish_time, or the field of a stamp that every topic has, such as header.stamp. A clock of the
-    calendar is counted from the record's first whole second. Raises ValueError, one sentence, where
+    calendar is counted from the record's first whole second. Raises ValueError, one sentence, if
     the file cannot be read, for a topic that is not there, and for frames and signals that do not
     overlap in time; what is damaged is left out and noted. At most `unreadable_share` of the frames
     may turn out not to be decodable when they are asked for.

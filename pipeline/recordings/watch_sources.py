@@ -247,7 +247,7 @@ class RecordingSource:
                 self.signals[name] = value
 
     def _decoder(self, message: Message) -> tuple[list[str], Decode] | None:
-        """Our signals that a channel has, and what reads them; None where it has none."""
+        """Our signals that a channel has, and what reads them; None if it has none."""
         channel = message.channel
         try:
             names = set(fields(channel, [message.data]))

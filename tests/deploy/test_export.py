@@ -375,13 +375,30 @@ def test_the_settings_replace_neither_the_owner_s_pid_nor_max_temp(section):
     assert to_klipper.FILE != "printer.cfg"
 
 
+@pytest.mark.parametrize(
+    ("names", "section"),
+    [
+        (("heater_bed.pwm", "temperature_bed"), "heater_bed"), (("duty", "bed"), "heater_bed"),
+        (("extruder.pwm", "temperature_extruder"), "extruder"), (("heater_1", "embedded_sensor"), "extruder"),
+    ],
+)  # fmt: skip
+def test_the_heater_of_klipper_is_the_bed_s_if_a_signal_is_called_after_it(names, section):
+    of = exported(zones=1)
+    heater, sensor = (
+        of.machine.inputs[0]._replace(name=names[0]),
+        of.machine.outputs[0]._replace(name=names[1]),
+    )
+    of = of._replace(machine=of.machine._replace(inputs=(heater,), outputs=(sensor,)))
+    assert export.klipper_section(of) == section
+
+
 def test_the_readme_for_klipper_is_followed_there_and_back(tmp_path):
     """Its lines run as they stand; the owner's files are then what they were."""
     of, home = exported(zones=1), tmp_path / "export"
     extras, config = tmp_path / "klipper/klippy/extras", tmp_path / "config"
     for folder in (home, extras, config):
         folder.mkdir(parents=True)
-    for name, text in export.files(of, passed(of), "klipper", "extruder").items():
+    for name, text in export.files(of, passed(of), "klipper").items():
         (home / name).write_text(text)
     owned = "[extruder]\ncontrol = pid\npid_kp = 22.2\nmax_temp = 260\n\n#*# <--- SAVE_CONFIG --->\n"
     (config / "printer.cfg").write_text(owned)
@@ -403,7 +420,7 @@ def test_the_readme_for_klipper_is_followed_there_and_back(tmp_path):
 def test_the_readme_of_each_form_is_followed_there_and_back(tmp_path, to, place):
     of, home, target = exported(zones=1), tmp_path / "export", tmp_path / place
     home.mkdir(), target.mkdir()
-    for name, text in export.files(of, passed(of), to, "extruder").items():
+    for name, text in export.files(of, passed(of), to).items():
         (home / name).write_text(text)
     there, back = (home / "README.txt").read_text().replace(f"{place}/", f"{target}/").split("Go back\n")
     for part, count in ((there, {"c": 4, "python": 1}[to]), (back, 0)):

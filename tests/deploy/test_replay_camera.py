@@ -51,27 +51,23 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "setpoint"
 
 
-def frames(path) -> str:
-    """A print of too little flow, from the tip on; the tip as --tip takes it."""
+def frames(path) -> tuple[float, float]:
+    """A print of too little flow, from the tip on; the tip as train_classifier.tip_px has it."""
     rng = np.random.default_rng(4)
     n = WINDOWS * FRAMES
     shown = nozzle_scene.render(nozzle_scene.draw_segment(rng), np.full(n, NARROW), np.full(n, 210.0), rng)
     path.mkdir()
     for k, frame in enumerate(shown.frames):
         cv2.imwrite(str(path / f"f{k:03d}.png"), frame)
-    return ",".join(f"{number:.1f}" for number in shown.tip)
-
-
-def replayed(folder, recording, out, monkeypatch, *more: str) -> None:
-    monkeypatch.setattr(
-        sys, "argv", ["beadline", "replay", str(folder), str(recording), "--out", str(out), *more]
-    )
-    cli.main()
+    return float(shown.tip[0]), float(shown.tip[1])
 
 
 def test_a_folder_of_frames_is_decided_window_by_window(folder, tmp_path, monkeypatch, capsys):
-    tip = frames(tmp_path / "frames")
-    replayed(folder, tmp_path / "frames", tmp_path / "out", monkeypatch, "--tip", tip, "--flow", "55")
+    tip, ready = frames(tmp_path / "frames"), deploy.ready
+    monkeypatch.setattr(deploy, "ready", lambda levels: ready(levels)._replace(tip=tip))
+    words = ["replay", folder, tmp_path / "frames", "--out", tmp_path / "out"]
+    monkeypatch.setattr(sys, "argv", ["beadline", *map(str, words)])
+    cli.main()
     assert f"{WINDOWS} decisions" in capsys.readouterr().out
     with next((tmp_path / "out").glob("decisions-*.mcap")).open("rb") as stream:
         rows = [json.loads(message.data) for _, _, message in make_reader(stream).iter_messages()]

@@ -428,14 +428,14 @@ def test_a_verification_is_written_composed_and_shown_beside_what_was_measured(f
 # ---- what a machine may run out of
 
 COMPOSE = ["beadline", "compose", "datasets/parts/fig9.gcode", "--as", "csv,parquet,mcap", "--out", "jobs"]
-LARGER = [*COMPOSE, "--scale", "1.5"]
+WIDER = [*COMPOSE, "--filament-mm", "0.7"]
 TWICE = """
 import os, resource, sys
 from pathlib import Path
 from pipeline import cli
 sys.argv = {compose}
 cli.main()
-sys.argv = {larger}
+sys.argv = {wider}
 {trouble}
 cli.main()
 """
@@ -467,7 +467,7 @@ def test_composing_on_a_machine_that_runs_out_is_one_sentence_and_leaves_the_las
     cli.main()
     before = {path.name: path.read_bytes() for path in Path("jobs").iterdir()}
     ended = subprocess.run(
-        [sys.executable, "-c", TWICE.format(compose=COMPOSE, larger=LARGER, trouble=spoil)],
+        [sys.executable, "-c", TWICE.format(compose=COMPOSE, wider=WIDER, trouble=spoil)],
         capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)}, timeout=300, check=False,
     )  # fmt: skip
     Path("jobs").chmod(0o755)
@@ -475,7 +475,7 @@ def test_composing_on_a_machine_that_runs_out_is_one_sentence_and_leaves_the_las
     assert "Traceback" not in ended.stderr
     assert {path.name: path.read_bytes() for path in Path("jobs").iterdir()} == before
     # and the next call gives what it would have given
-    monkeypatch.setattr(sys, "argv", LARGER)
+    monkeypatch.setattr(sys, "argv", WIDER)
     cli.main()
     assert {path.name for path in Path("jobs").iterdir()} == set(before)
     assert Path("jobs/fig9.signal.csv").read_bytes() != before["fig9.signal.csv"]

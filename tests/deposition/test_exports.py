@@ -116,21 +116,11 @@ def test_flow_percent_and_cubic_millimetres_count():
     assert volume.tolist() == pytest.approx([area, area / 2, 0.5, area / 2, 25.4 * area])
 
 
-def test_scale_and_speed(tmp_path, machine):
-    plain, asked = part(tmp_path, machine, line(0.2)), {"scale": 1.25, "speed": 0.5}
-    made = part(tmp_path, machine, line(0.2), **asked)
-    a, b = plain.conformance.lines, made.conformance.lines
-    assert b.length_mm[0] == pytest.approx(1.25 * a.length_mm[0])
-    assert b.planned_mm3[0] == pytest.approx(1.25**3 * a.planned_mm3[0])
-    assert b.duration_s[0] == pytest.approx(2.5 * a.duration_s[0], rel=0.01)  # the gantry's ramps
-    by_bead = part(tmp_path, machine, line(0.2), declared_bead=True, **asked)
-    assert by_bead.conformance.lines.planned_mm3[0] == pytest.approx(50 * machine[0].bead_area_mm2)
-
-
-def test_arcs_keep_their_shape_when_resized():
-    program = extrusion.resized(gcode.parse("G0 X10\nG3 X0 Y10 I-10 J0 E1\n"), scale=2.0)
-    m = program.moves
-    assert m.length[1] == pytest.approx(10 * math.pi) and m.centre[1].tolist() == [0, 0]
+def test_feeds_are_those_of_the_program_times_its_own_factor(tmp_path, machine):
+    plain, slower = part(tmp_path, machine, line(0.2)), part(tmp_path, machine, "M220 S50\n" + line(0.2))
+    a, b = plain.conformance.lines, slower.conformance.lines
+    assert b.planned_mm3[0] == pytest.approx(a.planned_mm3[0])
+    assert b.duration_s[0] == pytest.approx(2 * a.duration_s[0], rel=0.01)  # the gantry's ramps
 
 
 # ---- in words
@@ -312,14 +302,13 @@ def test_bends_keep_straight_lines_within_the_tolerance():
 @pytest.mark.parametrize(
     ("flags", "why"),
     [
-        ({"scale": 0.0}, "--scale: expected a number above 0"),
-        ({"speed": -1.0}, "--speed: expected"),
+        ({"filament_mm": 0.0}, "--filament-mm: expected a number above 0"),
         ({"filament_mm": math.nan}, "--filament-mm: expected"),
-        ({"scale": math.inf}, "--scale: expected"),
+        ({"filament_mm": math.inf}, "--filament-mm: expected"),
     ],
 )
 def test_flags_out_of_range_are_refused_by_name(flags, why):
-    given = {"scale": 1.0, "speed": 1.0, "filament_mm": None, "extruder": "", "bead": "e"} | flags
+    given = {"filament_mm": None, "extruder": "", "bead": "e"} | flags
     with pytest.raises(ValueError, match=why):
         compose.request(**given)
     with pytest.raises(ValueError, match=r"--as: expected some of csv, parquet, mcap, gcode, found xls"):

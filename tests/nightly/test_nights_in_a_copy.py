@@ -200,6 +200,10 @@ def test_a_worse_challenger_stays_out_and_rollback_goes_back_bit_by_bit_for_good
     ):
         with pytest.raises(ValueError, match=sentence):
             by_hand.rollback(to, loop)
+    words = ("night-0001", "toy", "toy/night-0001", "production/toy/night-0001", "")
+    assert [by_hand.named(word) for word in words] == [
+        *(("night-0001", ""), ("", "toy"), *2 * [("night-0001", "toy")], ("", ""))
+    ]
 
 
 def test_a_champion_whose_files_no_cache_and_no_remote_has_is_not_gone_back_to(project):

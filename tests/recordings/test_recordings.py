@@ -6,6 +6,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from pipeline.recordings.csv_files import csv_layout, read_csv
 from pipeline.recordings.recordings import Source, inspect, nearest_names, read
 from pipeline.store.artifacts import write_recording
 from tests.mcap_writing import Written
@@ -316,6 +317,71 @@ def test_zeros_after_a_power_failure_are_left_out_and_noted(tmp_path):
 )
 def test_bad_tables_are_refused_with_the_place_and_the_remedy(tmp_path, content, sentence):
     assert sentence in refusal(tmp_path, content)
+
+
+HEADERS = {"with a time": "t,u,y", "without": "index,u,y"}
+
+
+def short_table(header: str, rows: int, place: int, more: str) -> tuple[str, list[str]]:
+    """A table of so many rows, of which the one at `place` (from 1) has a field more or, if `more` is empty,
+    less; and its names."""
+    lines = [f"{k},{k + 0.5},{k + 20}" for k in range(rows)]
+    lines[place - 1] = f"{lines[place - 1]}{more}" if more else lines[place - 1].rpartition(",")[0]
+    return "\n".join([header, *lines]) + "\n", header.split(",")
+
+
+@pytest.mark.parametrize("header", HEADERS)
+@pytest.mark.parametrize(("rows", "more"), [(2, ",7"), (3, ",7"), (30, ",7"), (2, ""), (3, ""), (30, "")])
+def test_a_last_row_that_is_too_wide_or_too_narrow_is_left_out_and_keeps_the_names(
+    tmp_path, header, rows, more
+):
+    content, names = short_table(HEADERS[header], rows, rows, more)
+    path = tmp_path / "log.csv"
+    path.write_text(content)
+    layout = csv_layout(path)
+    assert (layout.names, layout.skip) == (names, 1)
+    columns, notes = read_csv(path, names[1:], "" if header == "with a time" else "every 1 s")
+    assert columns.values["y"].tolist() == [20.0 + k for k in range(rows - 1)]
+    sentence = (
+        f"line {rows + 1} has 4 fields but the header has 3 columns; it is the last and was left out"
+        if more
+        else f"line {rows + 1}, the last, breaks off after 2 of 3 fields and was left out"
+    )
+    assert [note.message for note in notes] == [sentence]
+
+
+@pytest.mark.parametrize("header", HEADERS)
+@pytest.mark.parametrize("more", [",7", ""], ids=["wider", "narrower"])
+@pytest.mark.parametrize(("rows", "place"), [(2, 1), (3, 1), (3, 2), (30, 1), (30, 15)])
+def test_another_row_of_another_width_is_refused_with_its_line(tmp_path, header, rows, place, more):
+    content, names = short_table(HEADERS[header], rows, place, more)
+    path = tmp_path / "log.csv"
+    path.write_text(content)
+    sentence = f"line {place + 1} has {4 if more else 2} fields but the header has 3 columns; mend or remove"
+    with pytest.raises(ValueError, match=sentence):
+        read_csv(path, names[1:], "" if header == "with a time" else "every 1 s")
+
+
+@pytest.mark.parametrize("more", [",7", ""], ids=["wider", "narrower"])
+def test_a_single_row_of_another_width_is_refused_with_its_line(tmp_path, more):
+    found = refusal(tmp_path, short_table("t,u,y", 1, 1, more)[0])
+    assert f"(line 2 has {4 if more else 2} fields but the header has 3 columns); mend the rows" in found
+
+
+@pytest.mark.parametrize(
+    ("above", "names"),
+    [
+        ("", ["column_1", "column_2", "column_3"]),
+        ("Logger X1\nrun 7, noon\n\n", ["column_1", "column_2", "column_3"]),
+        ("u,y\n", ["column_1", "column_2", "column_3"]),  # as R writes names: none above the rows' own
+    ],
+    ids=["no header", "a preamble", "a name less than columns"],
+)
+def test_rows_without_names_above_them_are_named_by_their_places(tmp_path, above, names):
+    path = tmp_path / "log.csv"
+    path.write_text(above + "0,1,2\n1,2,3\n2,3,4\n")
+    assert csv_layout(path).names == names
+    assert read_csv(path, ["column_3"], "every 1 s")[0].values["column_3"].tolist() == [2, 3, 4]
 
 
 def test_one_row_is_a_record_of_one_sample(tmp_path):

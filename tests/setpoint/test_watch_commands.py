@@ -14,6 +14,7 @@ import pytest
 from mcap.reader import make_reader
 
 from pipeline import cli
+from pipeline.commands import shadow
 from pipeline.commands.levels_files import LEVELS_FILE, RecordedLevels, store_levels
 from pipeline.setpoint.agents.agent import QNetwork
 from pipeline.setpoint.agents.files import store_published
@@ -33,6 +34,7 @@ from tests.setpoint.synthetic import synthetic_flow_table
 from tests.setpoint.test_shadow import ANY_CAMERA, PROVEN, TIP, picture
 
 ROOT = Path(__file__).resolve().parents[2]
+DONE = shadow.Watched(0, 0, 0, 0, Path("index.html"), Path("decisions.mcap"))
 
 
 @pytest.fixture
@@ -99,6 +101,12 @@ def camera(count: int) -> None:
         cv2.imwrite(f"in/f{k}.png", picture(k, 6.0))
 
 
+def change_settings(before: str, after: str) -> None:
+    text = Path(params.FILE).read_text()
+    assert text.count(before) == 1
+    Path(params.FILE).write_text(text.replace(before, after))
+
+
 def decisions() -> list[dict]:
     with Path("shadow/decisions-0000.mcap").open("rb") as stream:
         return [json.loads(message.data) for _, _, message in make_reader(stream).iter_messages()]
@@ -161,12 +169,20 @@ def test_a_camera_that_cannot_be_judged_is_held_and_the_first_line_says_why(
 
 def test_the_material_of_the_settings_is_what_is_watched(command, trained):
     camera(20)
-    text = Path(params.FILE).read_text()
-    assert text.count("good_flow_percent: [90, 110]") == 1
-    Path(params.FILE).write_text(text.replace("good_flow_percent: [90, 110]", "good_flow_percent: [85, 120]"))
+    change_settings("good_flow_percent: [90, 110]", "good_flow_percent: [85, 120]")
     status, _, wrong = command("shadow", "in", "--once", "--tip", f"{TIP[0]:g},{TIP[1]:g}")
     assert (status, wrong) == (0, "")
     assert "inside 85 to 120 % with" in Path("shadow/index.html").read_text()
+
+
+def test_a_source_without_a_temperature_prints_at_the_best_one_of_the_settings(command, trained, monkeypatch):
+    given = []
+    monkeypatch.setattr(shadow, "watch", lambda _source, _loop, asked, *_, **__: given.append(asked) or DONE)
+    Path("in").mkdir()
+    change_settings("best_temperature_degC: 210", "best_temperature_degC: 225")
+    assert command("shadow", "in", "--once")[0] == 0
+    assert command("shadow", "in", "--once", "--temperature", "215")[0] == 0
+    assert [asked.temperature for asked in given] == [225, 215]
 
 
 def test_levels_of_this_camera_are_used_and_those_of_another_classifier_are_not(command, trained):
@@ -196,7 +212,7 @@ def test_levels_of_this_camera_are_used_and_those_of_another_classifier_are_not(
 def test_a_classifier_that_learned_nothing_sees_no_flow(command, trained):
     camera(200)
     status, said, wrong = command(
-        "calibrate", "levels", "in", "--tip", f"{TIP[0]:g},{TIP[1]:g}", "--hold", "5", "--settle", "0"
+        "calibrate", "levels", "in", "--tip", f"{TIP[0]:g},{TIP[1]:g}", "--hold", "5"
     )
     assert (status, said, len(wrong.splitlines())) == (1, "", 1)
     assert not Path(LEVELS_FILE).exists()

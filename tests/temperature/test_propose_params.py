@@ -218,7 +218,7 @@ def test_the_next_experiment_is_asked_at_the_machines_pace_and_its_centre_left_t
     header = "time_s,heater_1_pct,heater_2_pct,zone_1_C,zone_2_C"
     np.savetxt(tree / "rig.csv", rows, delimiter=",", header=header, comments="", fmt="%.3f")
     init(monkeypatch, "rig.csv")
-    assert "is written only where its forecast stays within low and high" in capsys.readouterr().out
+    assert "is written only if its forecast stays within low and high" in capsys.readouterr().out
     settings = params.load(GenerateProbing, "generate_probing")
     assert settings.centre_percent is None and settings.signal == "prbs"
     assert settings.amplitude_percent <= 10.0  # no wider than the inputs moved

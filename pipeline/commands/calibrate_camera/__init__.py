@@ -54,7 +54,7 @@ class Calibrated(NamedTuple):
 
 def calibrate(request: CalibrationRequest, out: Path, *, write: bool) -> str:
     """Writes the page to `out`, with `write` the values into params.yaml, and returns a summary. Raises
-    ValueError where a picture cannot be read, shows fewer lines than widths are known, or contradicts them.
+    ValueError if a picture cannot be read, shows fewer lines than widths are known, or contradicts them.
     """
     camera, printer = params.load(Camera, "camera"), params.load(Printer, "printer")
     pictures = [_frames(path, camera) for path in request.images]
@@ -207,7 +207,7 @@ def _values(
 
 
 def numbers(text: str, flag: str, example: str) -> list[float]:
-    """[0.5, 0.9] of "0.5,0.9". Raises ValueError where that is no list of finite numbers."""
+    """[0.5, 0.9] of "0.5,0.9". Raises ValueError if that is no list of finite numbers."""
     try:
         found = [float(part) for part in text.split(",")]
     except ValueError:

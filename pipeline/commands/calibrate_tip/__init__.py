@@ -27,7 +27,7 @@ def calibrate(image: Path, out: Path, tip: str, *, least_score: float, topic: st
     """Writes the page of a picture, or of the middle frame of `topic` of an MCAP recording, to `out`, and
     returns a summary; `tip` is "x,y" in px, or empty.
 
-    Raises ValueError where the picture cannot be read, is too small, or has the tip outside.
+    Raises ValueError if the picture cannot be read, is too small, or has the tip outside.
     """
     tip_px = _pixel(tip) if tip else None
     frame = middle_frame(image, topic) if image.suffix.lower() == ".mcap" else read_image(image)
@@ -87,7 +87,7 @@ def _front_end(
         if area.reason
         else "<strong>accepted</strong>"
     )
-    # the rectangle is looked at even where it is rejected: that shows why
+    # the rectangle is looked at even if it is rejected: that shows why
     image = (
         area.image
         if not area.reason

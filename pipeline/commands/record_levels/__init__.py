@@ -25,13 +25,15 @@ from pipeline.store.printable import counted, printable_page
 
 # classes of the published material lie between these, in percent
 BORDERS = np.array(PLA.good_flow_percent)
+# the share of each hold, after the change of flow, in which the melt still follows
+SETTLES = 1 / 6
 # of the page's drawing
 WIDTH, HEIGHT, MARGIN = 560, 360, 40
 
 
 class Protocol(NamedTuple):
     """How it was recorded: flows in percent in their order, seconds that each was held, seconds after each
-    change in which the melt follows, temperature in degC where the source has none, the tip in px."""
+    change in which the melt follows, temperature in degC if the source has none, the tip in px."""
 
     flows: tuple[float, ...]
     hold_s: float
@@ -83,7 +85,7 @@ class _Window(NamedTuple):
 def record(
     source: FrameSource, protocol: Protocol, eye: Eye, *, place: str
 ) -> tuple[RecordedLevels, list[Level]]:
-    """The levels that the frames of a source show. Raises ValueError, one sentence, where they do not
+    """The levels that the frames of a source show. Raises ValueError, one sentence, if they do not
     suffice."""
     windows = _windows(source, protocol, eye, place)
     with artifacts.about(place):
@@ -117,7 +119,7 @@ def record(
 
 
 def _camera(windows: Sequence[_Window]) -> KnownCamera | None:
-    """How this camera looks, each window counted as a segment; None where there are too few to know it by."""
+    """How this camera looks, each window counted as a segment; None if there are too few to know it by."""
     looks = np.array([window.looks for window in windows])
     try:
         return familiar.fit_camera(looks, np.arange(len(looks)), false_alarms=FALSE_ALARMS)
@@ -179,7 +181,7 @@ def _timed(frames, times: list[float]):
 
 
 def _frames(source: FrameSource, place: str):
-    """Every frame that a source has now. Raises ValueError where it has none."""
+    """Every frame that a source has now. Raises ValueError if it has none."""
     count = 0
     while True:
         came = 0
@@ -199,7 +201,7 @@ def _frames(source: FrameSource, place: str):
 
 def _of_levels(frames, protocol: Protocol):
     """(flow, frame) of the frames of the levels, those left out in which the melt still follows. The flow is
-    the recording's, where it has one; else that of the protocol by the time since the first frame."""
+    the recording's, if it has one; else that of the protocol by the time since the first frame."""
     first = changed = before = np.nan
     for shown in frames:
         first = shown.time_s if np.isnan(first) else first
@@ -240,7 +242,7 @@ def _seen(window: Sequence[CameraFrame], flow: float, protocol: Protocol, eye: E
 
 
 def source_of(place: Path, recording: Callable[[Path], RecordingSource]) -> FrameSource:
-    """A folder of pictures or an MCAP recording. Raises ValueError where there is none."""
+    """A folder of pictures or an MCAP recording. Raises ValueError if there is none."""
     if not place.exists():
         raise ValueError(f"{place} is missing; name the folder of pictures, or the recording")
     return recording(place) if place.is_file() else Folder(place)

@@ -29,7 +29,7 @@ PAGE_S, LISTED = 2.0, 30
 
 class Watched(NamedTuple):
     """What a watch saw: frames, decisions, how many of them would have changed a setpoint and how many were
-    held, and the files; where there was no window, why; if no frame could be read, why the last could not."""
+    held, and the files; if there was no window, why; if no frame could be read, why the last could not."""
 
     frames: int
     decisions: int
@@ -53,7 +53,7 @@ def watch(
     """Watches until `stopped`, or with asked.once until the source ends; `place` is its name as shown.
 
     The page and the decisions stand in `out`; if no frame could be read, `out` is as it was before. Raises
-    OSError where not even the first page can be written.
+    OSError if not even the first page can be written.
     """
     earlier = {path: path.read_bytes() for path in out.glob("index.html")} if out.is_dir() else None
     about = {"source": place, "controller": deployed.name, "sent": "nothing"}
@@ -150,7 +150,7 @@ def _has_ended(source: FrameSource, came: bool, quiet_s: float, decisions: int) 
     """Whether a source that is looked at once has no more: nothing came for quiet_s since its last frame or
     since it is there. A camera that never ends has shown a window.
 
-    Raises OSError where it was waited for in vain.
+    Raises OSError if it was waited for in vain.
     """
     if isinstance(source, Snapshots) and decisions:
         return True

@@ -32,7 +32,7 @@ SHOWN = 3
 
 
 class DrawnFrame(NamedTuple):
-    """A frame's crop (350, 350, 3) uint8 RGB with the key area drawn in; the reason where it was rejected."""
+    """A frame's crop (350, 350, 3) uint8 RGB with the key area drawn in; the reason if it was rejected."""
 
     name: str
     picture: np.ndarray
@@ -40,7 +40,7 @@ class DrawnFrame(NamedTuple):
 
 
 class WatchOptions(NamedTuple):
-    """What a person says of the print: flow in percent and temperature in degC where the source does not say
+    """What a person says of the print: flow in percent and temperature in degC if the source does not say
     them, the tip (x, y) in px or None, and whether to end where the source does."""
 
     flow: float
@@ -54,8 +54,8 @@ class DeployedLoop(NamedTuple):
 
     read(images (n, 16, 48), temperature (n,)) -> what n key areas show; window_flow(log_flow, deviation,
     valid, looks), each (E, W), looks (E, measures) -> flow_seen in percent, spread and class probabilities of
-    windows, those of this camera where levels were recorded; how the known camera looks, and what is proven
-    of it (`proof`): where it cannot be judged all is held; the default controller with its name and
+    windows, those of this camera if levels were recorded; how the known camera looks, and what is proven
+    of it (`proof`): if it cannot be judged all is held; the default controller with its name and
     parameters, frames of a window, the front end's least score, how a window is judged, the limits, how long
     after a move of the setpoint frames are of no use, how far the nozzle may be from where its tip was. All
     of it is of the published material; `material` is the one that is printed.
@@ -80,7 +80,7 @@ class DeployedLoop(NamedTuple):
 class ShadowDecision(NamedTuple):
     """One window: what was seen, what it would do, and what the page shows of it; setpoint, would and flow
     seen are of the material that is printed. belief (N,) over flow_filter.GRID, flows of the published one,
-    or None where the controller has none; pictures are of some of its frames."""
+    or None if the controller has none; pictures are of some of its frames."""
 
     number: int
     time_s: float

@@ -22,7 +22,7 @@ _NUMBER, _TEXT, _TRUTH, _WHOLE = (
 FIELDS: dict[str, tuple[dict, str, str]] = {
     "decision": (_WHOLE, "1", "number of the window, from 1"),
     "time_s": (_NUMBER, "s", "of the window's last frame, since the first frame of the watch"),
-    "reason": (_TEXT, "1", "why it would hold; 'acts' where it would not"),
+    "reason": (_TEXT, "1", "why it would hold; 'acts' if it would not"),
     "would": (_TEXT, "1", "what it would have sent; nothing was sent"),
     "why": (_TEXT, "1", "the decision in one line"),
     "flow_setpoint_percent": (_NUMBER, "percent", "as the source or the command line says"),
@@ -32,7 +32,7 @@ FIELDS: dict[str, tuple[dict, str, str]] = {
     "p_under": (_NUMBER, "1", "share of under-extruded"),
     "p_good": (_NUMBER, "1", "share of good"),
     "p_over": (_NUMBER, "1", "share of over-extruded"),
-    "flow_seen_percent": (_NUMBER, "percent", "flow that the window shows, where the classifier gives one"),
+    "flow_seen_percent": (_NUMBER, "percent", "flow that the window shows, if the classifier gives one"),
     "spread": (_NUMBER, "1", "its relative standard deviation"),
     "belief_flow_percent": (_NUMBER, "percent", "median of the controller's belief"),
     "belief_low_percent": (_NUMBER, "percent", "5 % of the belief lie below"),
@@ -54,7 +54,7 @@ FIELDS: dict[str, tuple[dict, str, str]] = {
 def write_decisions(path: Path, rows: list[tuple[int, Mapping[str, Any]]], about: Mapping[str, str]) -> None:
     """One whole MCAP file of rows (log time in ns, {field of FIELDS: value}); `about` is its metadata.
 
-    Raises OSError, one sentence, where it cannot be written: the file before stays.
+    Raises OSError, one sentence, if it cannot be written: the file before stays.
     """
     properties = {
         name: kind | {"unit": unit, "description": meaning} for name, (kind, unit, meaning) in FIELDS.items()
@@ -97,7 +97,7 @@ class DecisionLog:
             self.write_down()
 
     def write_down(self) -> None:
-        """Writes what is not written yet; the next file is begun where this one is full."""
+        """Writes what is not written yet; the next file is begun if this one is full."""
         self.saved_at = time.monotonic()
         if self.saved == len(self.rows):
             return

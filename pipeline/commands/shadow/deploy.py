@@ -24,7 +24,7 @@ from pipeline.store import artifacts, params
 
 # what a printer can be told: percent of flow, degC; pictures a second; seconds
 BOUNDS = {"--flow": (1.0, 1000.0), "--temperature": (0.0, 600.0), "--rate": (0.05, 100.0),
-          "--hold": (5.0, 3600.0), "--settle": (0.0, 600.0)}  # fmt: skip
+          "--hold": (5.0, 3600.0)}  # fmt: skip
 
 
 WEIGHTS = "datasets/train_classifier/weights.safetensors"
@@ -48,7 +48,7 @@ class TrainedClassifier(NamedTuple):
 
 
 def trained() -> TrainedClassifier:
-    """Raises ValueError, one sentence, where the stage has not run."""
+    """Raises ValueError, one sentence, if the stage has not run."""
     view = params.load(TrainClassifier, "train_classifier")
     model = restore_classifier(WEIGHTS, "datasets/train_classifier/calibration.parquet")
     return TrainedClassifier(model, artifacts.sha256(WEIGHTS), view)
@@ -56,8 +56,8 @@ def trained() -> TrainedClassifier:
 
 def ready(levels_file: str | None) -> Ready:
     """The default of evaluate_setpoint with the classifier of train_classifier, and the levels of this
-    camera: of `levels_file`, or where that is empty of LEVELS_FILE, if it is there; None for those that were
-    judged. Raises ValueError, one sentence, where a stage has not run."""
+    camera: of `levels_file`, or if that is empty of LEVELS_FILE, if it is there; None for those that were
+    judged. Raises ValueError, one sentence, if a stage has not run."""
     settings = params.load(EvaluateSetpoint, "evaluate_setpoint")
     model, digest, view = trained()
     name = str(artifacts.read_json("datasets/evaluate_setpoint/choice.json")["name"])
@@ -110,15 +110,18 @@ def of_camera(
     return WindowFlow(seen, np.where(some, of.spread, np.nan), prob)
 
 
-def asked(flow: float, temperature: float, tip: str, *, once: bool, settings: Ready) -> WatchOptions:
-    """What the command line says, checked; the tip of the settings where it says none."""
+def asked(flow: float, temperature: float | None, tip: str, *, once: bool, settings: Ready) -> WatchOptions:
+    """What the command line says, checked; if it says none, the best temperature of the material and the tip
+    of the settings."""
     bounded("--flow", flow)
+    if temperature is None:
+        temperature = settings.deployed.material.best_temperature_degC
     bounded("--temperature", temperature)
     return WatchOptions(flow, temperature, pixel(tip) if tip else settings.tip, once)
 
 
 def bounded(flag: str, value: float) -> float:
-    """The value of a flag. Raises ValueError where it lies outside BOUNDS."""
+    """The value of a flag. Raises ValueError if it lies outside BOUNDS."""
     low, high = BOUNDS[flag]
     if not low <= value <= high:
         raise ValueError(

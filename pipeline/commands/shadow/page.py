@@ -35,7 +35,7 @@ def render(
     trouble: str,
 ) -> str:
     """The page after these decisions of `of`, the last one at the end. `state` is a sentence on why nothing
-    comes, "" where frames do; `trouble` why the decisions cannot be written. After ENDED it refreshes itself
+    comes, "" if frames do; `trouble` why the decisions cannot be written. After ENDED it refreshes itself
     no more."""
     last = decisions[-1] if decisions else None
     warnings = [text for text in (state, trouble) if text]

@@ -25,7 +25,7 @@ class FrameWindows:
         self.flow, self.waits_until, self.waited = np.nan, -np.inf, 0
 
     def add(self, shown: CameraFrame) -> list[CameraFrame] | None:
-        """The window that this frame fills, None where it fills none."""
+        """The window that this frame fills, None if it fills none."""
         if not np.isfinite(shown.time_s):
             self.notes.append(f"{shown.name}: its time is no number")
             return None

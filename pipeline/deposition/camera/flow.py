@@ -99,7 +99,7 @@ def sections(
 
     Readings are gathered by place. Those closer to the nozzle than its radius, where the bead still grows,
     are left out; so are those beyond five robust deviations from the median of their place. Raises ValueError
-    where nothing is left, or where the gantry does not move away from what the camera sees.
+    if nothing is left, or if the gantry does not move away from what the camera sees.
     """
     s, w = _readings(position, columns, widths, view, nozzle_radius_mm)
     px = abs(view.mm_per_px)
@@ -137,8 +137,8 @@ def column_trend(position: np.ndarray, columns: np.ndarray, widths: np.ndarray, 
 def _readings(
     position: np.ndarray, columns: np.ndarray, widths: np.ndarray, view: View, nozzle_radius_mm: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places (N,) in mm and widths (N,) in mm of the readings that count. Raises ValueError where there is
-    none, or where the gantry goes back."""
+    """Places (N,) in mm and widths (N,) in mm of the readings that count. Raises ValueError if there is
+    none, or if the gantry goes back."""
     behind = (columns - view.nozzle_column) * view.mm_per_px
     used = np.isfinite(widths) & (np.abs(behind) >= nozzle_radius_mm) & np.isfinite(position)[:, None]
     if not used.any():
@@ -192,7 +192,7 @@ def estimate(
     the command; none, as zeros (0, T)). The strength maximises the likelihood of A with all Q integrated out
     (generalised maximum likelihood, Wahba 1985). W carries the deviations of A, scaled to its scatter about
     the fit, and Huber's weights. `width_deviation_mm` is what a calibration leaves: it moves all widths
-    alike, so that Q is uncertain by Q 2 dw / w on top. Raises ValueError where no place is reached by the
+    alike, so that Q is uncertain by Q 2 dw / w on top. Raises ValueError if no place is reached by the
     nozzle.
     """
     dt = float(np.mean(np.diff(time_s)))

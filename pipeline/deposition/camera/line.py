@@ -79,7 +79,7 @@ def find(
     sign: int = 0,
 ) -> ImageLine | None:
     """The line with the most energy in the picture (h, w), or the one that comes out beside the nozzle's tip
-    (x, y) in px, seen from `hidden_px` on; None where there is none. What `mask` (h, w) marks is not looked
+    (x, y) in px, seen from `hidden_px` on; None if there is none. What `mask` (h, w) marks is not looked
     at. `sign` is 1 for a bead brighter than its ground, -1 for a darker one, 0 for either."""
     picture = gray(frame).astype(np.float32)
     h, w = picture.shape
@@ -410,7 +410,7 @@ def bead_alone(
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """The mean (h, w) of some frames in which the gantry moves along, and the same less the mean of some
     before it moved, about the middle level: nozzle, light and what else rides with the camera are gone. None
-    where it never moves."""
+    if it never moves."""
     x = np.interp(time_s, *gantry)
     travelled = np.abs(x - x[0]) / max(float(np.ptp(x)), 1e-9)
     before, along = np.flatnonzero(travelled < 1e-3), np.flatnonzero((travelled > 0.2) & (travelled < 0.95))

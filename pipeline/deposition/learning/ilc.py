@@ -49,7 +49,7 @@ YIELD_LEAD_S = 0.4
 
 class Trial(NamedTuple):
     """Command u (T,) in mm as the drive applied it, measured flow y (T,) in mm^3/s with NaN where it was not
-    observable, true flow where simulated."""
+    observable, true flow if simulated."""
 
     u: np.ndarray
     y: np.ndarray
@@ -257,7 +257,7 @@ class InverseLaw:
     The second line, with the average d of what the model misses, is the same if the gain g of the next trial
     is 1; for one trial both are Q (u + L e). The weights w_i average what does not repeat, and follow what
     changes (`trial_filter.repeating`); Q stays outside, so that it erodes nothing as they fall, and |1 - k +
-    k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k. Q ends earlier where the model's lag would have
+    k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k. Q ends earlier if the model's lag would have
     to be inverted far above its frequency (`known_share`), and what is learned is bounded by what the model
     alone asks for (`bounded`).
 
@@ -310,7 +310,7 @@ def gamma(Q: np.ndarray, L: np.ndarray, P: np.ndarray, delta: np.ndarray | float
     - L P| + |L P| delta): below 1 the error shrinks monotonically, above 1 it grows in the end (Bristow,
     Tharayil and Alleyne 2006; with the multiplicative uncertainty delta, de Roover and Bosgra 2000).
 
-    Q (F,) is |Q|^2 where Q runs both ways; L (F,); delta (F,); P (F,) or (plants, F), with all
+    Q (F,) is |Q|^2 if Q runs both ways; L (F,); delta (F,); P (F,) or (plants, F), with all
     the delay there is: the result is one number a plant.
     """
     return np.max(np.abs(Q) * (np.abs(1 - L * P) + np.abs(L * P) * delta), axis=-1)
@@ -378,7 +378,7 @@ def _ramp_of_speed(drive: Drive, steady: float, model: Extruder) -> float:
 
 
 def check_headroom(headroom: ActuatorHeadroom, *, drive: Drive, worst_ratio: float) -> None:
-    """Raises ValueError where no law can come below `worst_ratio` of trial 0's
+    """Raises ValueError if no law can come below `worst_ratio` of trial 0's
     error: the sentence names the ramp that would do."""
     if headroom.ratio <= worst_ratio:
         return

@@ -224,7 +224,7 @@ def actuator_headroom(
     routine: Routine, nominal: Extruder, *, worst_ratio: float, settings: LawSettings
 ) -> ilc.ActuatorHeadroom:
     """What the drive leaves of the routine, on the nominal model, before anything
-    runs. Raises ValueError where no law can come below worst_ratio of the error of on-off
+    runs. Raises ValueError if no law can come below worst_ratio of the error of on-off
     control; the sentence names the ramp that would do."""
     headroom = ilc.actuator_headroom(
         routine.r,

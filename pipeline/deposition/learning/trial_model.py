@@ -49,7 +49,7 @@ def identify(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s:
         min over (K, tau, delay, yield) of sum (max(x - yield, 0) - y)^2
 
     u (T,) in mm and measured flow y (T,) in mm^3/s of each trial; NaN in y is a sample that was not
-    observable. Raises ValueError where the command never moves, or hardly any flow was observable.
+    observable. Raises ValueError if the command never moves, or hardly any flow was observable.
     """
     u, y = [np.asarray(a, float) for a in u], [np.asarray(b, float) for b in y]
     _check(u, y)
@@ -144,7 +144,7 @@ def lag_delay_s(lag_hz: float) -> float:
 def _coarse(
     predicted: Callable[[float, float, float, float], np.ndarray], measured: np.ndarray
 ) -> tuple[float, float, float]:
-    """Gain, time constant and delay of the best first-order model on a grid. Raises ValueError where its gain
+    """Gain, time constant and delay of the best first-order model on a grid. Raises ValueError if its gain
     is not above 0."""
     starts = []
     for tau in TIME_CONSTANTS_S:

@@ -452,7 +452,7 @@ def identify(trainings: Sequence[Training], *, sample_time_s: float) -> Chain:
 
     One routine alone cannot be left out: then its rows are. Two speeds part gain from
     yield, which one speed cannot (they are collinear on one plateau). Raises TooFewTrials
-    without two trials of each, and ValueError where the commands do not press.
+    without two trials of each, and ValueError if the commands do not press.
     """
     if not trainings or any(len(training.u) < 2 for training in trainings):
         raise TooFewTrials(

@@ -370,7 +370,7 @@ def compose(
     """Commands for all tools of a part, each by the composer that is predicted to do best for its material.
 
     `materials` names the material of each tool. Raises ValueError for a tool without a material, a
-    material or nozzle that was not learned, where nothing is printed, and, with its line number, where the
+    material or nozzle that was not learned, if nothing is printed, and, with its line number, if the
     program would go from Steady-State to No-Flow without a Stop.
     """
     library, drive, moves = learned.library, settings.drive, program.moves

@@ -50,13 +50,11 @@ def wanted(
     bead_area_mm2: float,
     asked_mm: float | None = None,
     declared_mm: Mapping[int, float] | None = None,
-    scale: float = 1.0,
     declared_bead: bool = False,
 ) -> Extruded:
     """The volume of every printed move; with declared_bead the declared bead's for all. A tool's diameter is
     what was asked for, else what the program says (a slicer's comment, M200), else what the machine declares;
-    without one its lines are declared beads. A part made `scale` times as large asks for scale^3 of E's
-    volume."""
+    without one its lines are declared beads."""
     moves, said = program.moves, program.diameter_mm
     printed = (moves.kind == Kind.EXTRUDE) & (moves.length > 0)
     diameter, source, area = {}, {}, {}
@@ -77,7 +75,7 @@ def wanted(
         else:
             diameter[tool], source[tool] = d, f"diameter {d:g} mm, {where}"
             area[tool] = math.pi * d**2 / 4
-    e = volumes(program, diameter) * scale**3
+    e = volumes(program, diameter)
     by_e = printed & np.isfinite(e) & (not declared_bead)
     volume = np.where(by_e, e, np.where(printed, bead_area_mm2 * moves.length, np.nan))
     return Extruded(volume, by_e, source, area)
@@ -102,18 +100,6 @@ def differences(moves: Moves, extruded: Extruded, *, bead_area_mm2: float) -> li
             VolumeDifference(tool, float(volume.sum()), declared, (float(low), float(middle), float(high)))
         )
     return found
-
-
-def resized(program: PartProgram, *, scale: float = 1.0, speed: float = 1.0) -> PartProgram:
-    """The program with X, Y and Z `scale` times as large and every feed `speed` times as fast."""
-    moves = program.moves
-    if scale == speed == 1.0:
-        return program
-    moves = moves._replace(
-        start=moves.start * scale, end=moves.end * scale, length=moves.length * scale,
-        centre=moves.centre * scale, feed=moves.feed * speed,
-    )  # fmt: skip
-    return program._replace(moves=moves)
 
 
 def as_lengths(program: PartProgram, extruded: Extruded, *, bead_area_mm2: float) -> PartProgram:

@@ -340,7 +340,7 @@ def windows(
 ) -> tuple[PartWindow, ...]:
     """The hardest Start, Corner and Stop of one tool's share of a part, in the order of the part: where what
     may come out (M, T) for the wanted flow r (T,) differs most. Windows that overlap are one. Raises
-    ValueError where the tool prints nothing."""
+    ValueError if the tool prints nothing."""
     mine = np.flatnonzero(lines.tool == tool)
     if not len(mine) or not np.any(r > 0):
         raise ValueError(
@@ -445,7 +445,7 @@ def next_command(
 
 def measured_percent(y: np.ndarray, on_off: np.ndarray, r: np.ndarray) -> float:
     """R.m.s. error of a measured flow y (T,), NaN where it was not seen, in % of that of on-off control's
-    flow (T,) over the same samples. Raises ValueError where nothing was seen."""
+    flow (T,) over the same samples. Raises ValueError if nothing was seen."""
     seen = np.isfinite(y)
     if not seen.any():
         raise ValueError(

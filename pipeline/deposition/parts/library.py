@@ -123,7 +123,7 @@ def demarcate(trainings: Sequence[Training], *, sample_time_s: float) -> dict[st
     materials, speeds and pauses: the widest found.
 
     A task lasts while the smoothed command is off the level of the plateau beside it by more than max(2 % of
-    its peak, 3 sigma of the plateau). Raises ValueError where the plateaus are none: 3 sigma above 30 % of
+    its peak, 3 sigma of the plateau). Raises ValueError if the plateaus are none: 3 sigma above 30 % of
     the peak, or a task that lasts to the middle of its plateau.
     """
     marks = dict.fromkeys((START, CORNER, STOP), (0.0, 0.0))

@@ -41,9 +41,8 @@ class ComposedPart(NamedTuple):
     bead_area_mm2: float
 
 
-def parse(data: bytes, *, scale: float = 1.0, speed: float = 1.0, extruder: str = "") -> PartProgram:
-    """The part program with X, Y and Z `scale` times as large and feeds `speed` times as fast. Raises
-    ValueError if nothing of it prints because what would was refused."""
+def parse(data: bytes, *, extruder: str = "") -> PartProgram:
+    """The part program. Raises ValueError if nothing of it prints because what would was refused."""
     program = gcode.parse(data, extruder=extruder)
     if not np.any(program.moves.kind == gcode.Kind.EXTRUDE) and program.refusals:
         first = program.refusals[0]
@@ -51,7 +50,7 @@ def parse(data: bytes, *, scale: float = 1.0, speed: float = 1.0, extruder: str 
             f"line {first.line}: {first.why}; it was left out, "
             "and nothing of the program that could be read prints"
         )
-    return extrusion.resized(program, scale=scale, speed=speed)
+    return program
 
 
 def compose(
@@ -102,7 +101,7 @@ def check_duration(moves: Moves, planned: Motion) -> None:
 
 def slowed_to(plan: Motion, moves: Moves) -> float | None:
     """mm/s^2 at which the printed moves change speed where that is less than the program's and the travel's
-    own; None where none is slowed down."""
+    own; None if none is slowed down."""
     own = np.fmin(moves.acceleration, plan.acceleration.max(initial=0.0))
     slowed = _prints(moves) & (plan.acceleration < own)
     return float(plan.acceleration[slowed].max()) if slowed.any() else None

@@ -57,7 +57,7 @@ class Moves(NamedTuple):
 
 class OtherWord(NamedTuple):
     """A word that is no move, told once: how often it stands there, its first line, and what becomes of it,
-    "" where nothing is known of it."""
+    "" if nothing is known of it."""
 
     word: str
     count: int
@@ -221,7 +221,7 @@ def _longer(column: np.ndarray, room: int) -> np.ndarray:
 
 def parse(text: str | bytes, *, extruder: str = "") -> PartProgram:
     """The moves of a program, with all that was not understood beside them. `extruder` names what drives the
-    extrusion where the program leaves it open ("U", "M42 P4", ...).
+    extrusion if the program leaves it open ("U", "M42 P4", ...).
 
     Raises ValueError, in one sentence, for what is no G-code text at all: binary, empty, or without a single
     G, M or T word that can be read; and for an extruder that the program does not have.

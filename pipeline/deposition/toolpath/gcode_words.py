@@ -118,7 +118,7 @@ def text_bytes(text: str | bytes) -> bytes:
 
 
 def chunks(data: bytes, refusals: Refusals) -> Iterator[ProgramWords]:
-    """The words of the program, some CHUNK bytes of whole lines at a time. Raises ValueError where no line
+    """The words of the program, some CHUNK bytes of whole lines at a time. Raises ValueError if no line
     of the first ENOUGH that hold anything has a G, M or T word that can be read."""
     at, first, found, filled = 0, 1, False, 0
     while at < len(data):

@@ -159,7 +159,7 @@ def _look_ahead(cap: np.ndarray, gain: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def sampled(motion: Motion, moves: Moves, *, sample_time_s: float, rates_only: bool = False) -> MotionSignal:
     """The plan at t = 0, Ts, 2 Ts, ..., the last at most one Ts before its end; with `rates_only` no more
-    than `rate` needs, move and share, the other columns empty. Raises ValueError where that is more than MOST
+    than `rate` needs, move and share, the other columns empty. Raises ValueError if that is more than MOST
     samples."""
     end = motion.begin_s + motion.duration_s
     if len(end) and end[-1] > MOST * sample_time_s:

@@ -64,7 +64,7 @@ def printed_lines(moves: Moves, motion: Motion, *, corner_deg: float, longest_pa
     most `longest_pause_s` lies between two of one tool.
 
     A junction is a Corner where the path turns by `corner_deg` or more, or
-    halts. Raises ValueError where nothing is printed.
+    halts. Raises ValueError if nothing is printed.
     """
     at = np.flatnonzero((moves.kind == Kind.EXTRUDE) & (moves.length > 0))
     if not len(at):
@@ -147,7 +147,7 @@ def sequence(lines: PrintedLines, *, end_s: float) -> Tasks:
 
 
 def refuse(lines: PrintedLines, moves: Moves, *, halts: Collection[int], switch_s: float) -> None:
-    """Raises ValueError, with the line number, where a program would have
+    """Raises ValueError, with the line number, if a program would have
     to go from Steady-State to No-Flow without a Stop:
 
     a change of material with less than `switch_s` between the last line of the one and the
