@@ -250,7 +250,7 @@ def has_bare_field(fields: Sequence[str]) -> bool:
 
 
 def sample(values: np.ndarray) -> np.ndarray:
-    """Returns about LOOKED_AT of the values, evenly spaced from the first to the last."""
+    """Returns every k-th of the values, with k so large that fewer than twice LOOKED_AT remain."""
     return values[:: max(1, len(values) // LOOKED_AT)]
 
 
@@ -323,7 +323,7 @@ def _without_unheated(signals: Sequence[RecordedSignal]) -> list[RecordedSignal]
 def _without_strangers(signals: Sequence[RecordedSignal]) -> Sequence[RecordedSignal]:
     """Returns the signals; inputs that belong to no temperature become disturbances, for example the command
     of a drive among the commands of zones. An input belongs to an output with the same numbers or with one of
-    its words. It also belongs if its name says that it heats or cools."""
+    its words. It also belongs if its name means a heater, a cooler or a place."""
     outputs = [(_numbers(s.source), _plain_words(s.source)) for s in signals if s.role == "output"]
     inputs = [s for s in signals if s.role == "input"]
     shared = set.intersection(*(_plain_words(s.source) for s in inputs)) if inputs else set()
