@@ -35,7 +35,7 @@ class NightlyLoop(Section):
         if (self.judge == "cases") != bool(self.cases):
             raise ValueError(
                 f'has judge {self.judge} but cases "{self.cases}"; '
-                "name the file of costs where judge is cases, and only there"
+                "name the file of costs if judge is cases, and only there"
             )
         if self.cases and self.cases not in self.artifacts:
             raise ValueError(

@@ -1,5 +1,6 @@
-"""The format of a recording, and what all formats share: the records that pass between a file and the
-learners, columns on a clock, which column is the time, and tables that are small enough to be read whole."""
+"""Recognises the format of a recording. Holds what all formats share: the records that are passed from a file
+to the learners, columns on a clock, the choice of the time column, and tables small enough to be read
+whole."""
 
 import collections
 import difflib
@@ -14,10 +15,10 @@ import numpy as np
 
 
 class Source(NamedTuple):
-    """`signal` in `unit` is `scale` value + `offset` of the recording's `source`.
+    """`signal` in `unit` is `scale` times the recording's `source`, plus `offset`.
 
-    A source is a column, or "/topic:field.sub[2]" in MCAP. There a bare name is the field of that name in the
-    only topic that has it.
+    A source is a column, or "/topic:field.sub[2]" in MCAP. There, a field's name alone is enough if only one
+    topic has it.
     """
 
     signal: str
@@ -28,8 +29,8 @@ class Source(NamedTuple):
 
 
 class Note(NamedTuple):
-    """A remark of the reader on `count` messages, chunks, values or lines. `signal` is empty for the whole
-    recording."""
+    """A reader's remark on `count` messages, chunks, values or lines. `signal` is empty if it concerns the
+    whole recording."""
 
     kind: str
     signal: str
@@ -38,11 +39,11 @@ class Note(NamedTuple):
 
 
 class Raw(NamedTuple):
-    """A recording as it was made: {signal: (time_s (n,), values (n,))} with a clock each. A missing value is
-    NaN.
+    """A recording as it was made: {signal: (time_s (n,), values (n,))}, each signal with its own clock. A
+    missing value is NaN.
 
-    `messages` has the count of each topic's messages, or of the rows. `breaks` are the times at which the
-    clock had started over: nothing is held or interpolated from before to behind one.
+    `messages`: number of messages of each topic, or number of rows. `breaks`: times at which the clock had
+    started over. No value is held or interpolated across a break.
     """
 
     path: str
@@ -54,7 +55,7 @@ class Raw(NamedTuple):
 
 class Flag(NamedTuple):
     """A finding: what (`kind`), where (start_s to end_s), how many samples, and one sentence. `signal` is
-    empty for the whole recording."""
+    empty if it concerns the whole recording."""
 
     signal: str
     kind: str
@@ -65,8 +66,8 @@ class Flag(NamedTuple):
 
 
 class Jitter(NamedTuple):
-    """Intervals of one clock without those across gaps: their median, and the deviation from it (standard and
-    largest)."""
+    """Intervals of one clock, without those across gaps: their median, and their standard and largest
+    deviation from it."""
 
     interval_s: float
     std_s: float
@@ -76,8 +77,8 @@ class Jitter(NamedTuple):
 class Table(NamedTuple):
     """A recording on one sample time: T samples in segments without a gap.
 
-    `values` are as measured, never altered. `masked` marks those that are not to be used. `jitter` is that of
-    each signal's own clock before resampling.
+    `values`: as measured, never changed. `masked`: marks values that must not be used. `jitter`: of each
+    signal's own clock before resampling.
     """
 
     recording: str
@@ -94,7 +95,7 @@ MOST_COMPARED = 50_000
 
 
 def nearest_names(name: str, names: Iterable[str]) -> str:
-    """ "the nearest names are a, b": names like `name`, or the first ten that there are."""
+    """Returns "the nearest names are a, b" with names like `name`, or the first ten existing names."""
     names = sorted(set(names))
     if not names:
         return "it has none that can be read as a number"
@@ -125,13 +126,13 @@ _SERIAL = re.compile(rb"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} - (Recv|Send|Chang
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a folder is a ROS 2 bag."""
+    """Returns whether a folder is a ROS 2 bag."""
     return path.is_dir() and (path / METADATA).is_file()
 
 
 def other_format(path: Path, start: bytes) -> str:
-    """ "xlsx", "MATLAB", "Moonraker JSON", "klippy.log" or "serial.log", by the first 512 bytes and, of a
-    text, what follows; "" for anything else."""
+    """Returns "xlsx", "MATLAB", "Moonraker JSON", "klippy.log" or "serial.log", from the first 512 bytes and,
+    for a text, the first OPENING_BYTES; "" for anything else."""
     if start.startswith(b"PK\x03\x04"):
         return "xlsx" if _is_workbook(path) else ""
     if start.startswith(b"MATLAB 5.0"):
@@ -148,7 +149,7 @@ def other_format(path: Path, start: bytes) -> str:
 
 
 def _is_workbook(path: Path) -> bool:
-    """Whether a zip file is a workbook; of a damaged one the name tells."""
+    """Returns whether a zip file is a workbook. For a damaged file the name decides."""
     try:
         with zipfile.ZipFile(path) as archive:
             return "xl/workbook.xml" in archive.namelist()
@@ -262,8 +263,9 @@ _OTHER_FORMATS = {
 class FileColumns(NamedTuple):
     """Columns on one clock.
 
-    `time` is time_s (n,), or time_ns (n,) on a calendar. `place(i)` names the place of sample i in the file.
-    `zone` is the calendar's zone, empty if the file does not give it; `units` are those that it gives.
+    `time`: time_s (n,), or time_ns (n,) if the clock is a calendar's; `place(i)`: names the place of sample i
+    in the file; `zone`: the calendar's time zone, empty if the file does not give it; `units`: those that the
+    file gives.
     """
 
     name: str
@@ -291,8 +293,8 @@ class FileColumn(NamedTuple):
 
 
 def file_format(path: Path) -> str:
-    """ "mcap", "parquet", "csv", "bag" or a name of `LOADERS`, by the first bytes.
-    Text is "csv", but text named .mcap is refused.
+    """Returns "mcap", "parquet", "csv", "bag" or a name of `LOADERS`, from the first bytes. Text is "csv",
+    but text named .mcap is refused.
 
     Raises ValueError for any other format.
     """
@@ -339,8 +341,8 @@ def file_format(path: Path) -> str:
 
 
 def time_column(path: Path, names: Sequence[str], time: str) -> str:
-    """The column `time`, or the first with a name of a time. Raises ValueError with the names that there
-    are."""
+    """Returns the column `time` or, if `time` is empty, the column with the likeliest name of a time. Raises
+    ValueError with the existing names."""
     if time:
         if time not in names:
             raise ValueError(f"{path}: there is no time column {time!r}; {nearest_names(time, names)}")
@@ -371,20 +373,21 @@ def column_place(path: Path, names: Sequence[str], name: str) -> int:
 
 
 def column_places(path: Path, names: Sequence[str], wanted: Sequence[str]) -> list[int]:
-    """The places of the wanted columns, in one pass over the names. Raises ValueError for a name that is not
-    there, or there twice."""
+    """Returns the places of the wanted columns, in one pass over the names. Raises ValueError if a name is
+    missing or exists twice."""
     counts = collections.Counter(names)
     at = {name: i for i, name in enumerate(names)}
     return [at[name] if counts[name] == 1 else column_place(path, names, name) for name in wanted]
 
 
 def is_time_name(name: str) -> bool:
-    """Whether a column of that name is likely to be the time."""
+    """Returns whether a column of that name is likely to be the time."""
     return _time_rank(name) is not None
 
 
 def _time_rank(name: str) -> tuple[bool, int] | None:
-    """The rank of a column as the time, None for no time. A name with a unit of time comes first."""
+    """Returns the rank of a column as the time, None if it is no time. A name with a unit of time comes
+    first."""
     if name.strip() == "T":  # more often a temperature
         return True, len(_TIME_NAMES)
     base, unit = _time_unit(name)
@@ -392,8 +395,8 @@ def _time_rank(name: str) -> tuple[bool, int] | None:
 
 
 def _time_unit(name: str) -> tuple[str, str]:
-    """("time", "ms") of "Time [ms]", "time_ms" and the like. A time zone at the end is no part of the
-    name."""
+    """Returns ("time", "ms") for "Time [ms]", "time_ms" and the like. A time zone at the end is not part of
+    the name."""
     plain = re.sub(r"[\s_.]*[(\[/_\s]\s*(utc|gmt|local)\s*[)\]]?$", "", name.strip().casefold())
     if plain in _COUNTS:
         return "time", _COUNTS[plain]
@@ -403,22 +406,25 @@ def _time_unit(name: str) -> tuple[str, str]:
 
 
 def date_column(names: Sequence[str], clock: str) -> str | None:
-    """The column of the date beside that of the time of day, None beside a time from a start."""
+    """Returns the column of the date beside a column of the time of day; None if there is none, or if the
+    time counts from a start."""
     if _time_unit(clock)[0] in _ELAPSED:
         return None
     return next((name for name in names if name != clock and _time_unit(name)[0] in DATE_NAMES), None)
 
 
 def writes_day_first(names: Iterable[str]) -> bool:
-    """Whether a column of a time or a date is named in a language that writes the day before the month."""
+    """Returns whether a column of a time or a date is named in a language that writes the day before the
+    month."""
     return any(_time_unit(name)[0] in _DAY_FIRST for name in names)
 
 
 def seconds(name: str, numbers: np.ndarray, written: str = "") -> tuple[np.ndarray, str]:
-    """Time in seconds, and a remark if the unit was guessed.
+    """Returns time in seconds, and a remark if the unit was guessed.
 
-    The unit is that of the column's name, or the one `written` beside it, as in a row of units. Without one
-    it is seconds, or what the size of the numbers tells: an epoch, or a spreadsheet's days.
+    The unit is that of the column's name, or the one `written` beside it, as in a row of units. If neither
+    gives a unit, it is guessed from the size of the numbers: an epoch, a spreadsheet's days, or otherwise
+    seconds.
     """
     if unit := _unit_of_time(name, written):
         return numbers / _PER_SECOND[unit], ""
@@ -457,8 +463,8 @@ def seconds(name: str, numbers: np.ndarray, written: str = "") -> tuple[np.ndarr
 def clock_seconds(
     path: Path, name: str, numbers: np.ndarray, unit: str, notes: list[Note], *, is_declared: bool
 ) -> np.ndarray:
-    """The column of the time in seconds (n,); a guessed unit is noted. Raises ValueError for numbers that may
-    be fractions of a day, and, unless the column was declared, for an index that counts the rows."""
+    """Returns the time column in seconds (n,). A guessed unit is noted. Raises ValueError if the numbers may
+    be fractions of a day or, unless the column was declared, if they only count the rows."""
     times, remark = seconds(name, numbers, unit)
     if remark:
         notes.append(Note("clock", "", 1, remark))
@@ -481,14 +487,14 @@ def clock_seconds(
 
 
 def _unit_of_time(name: str, written: str) -> str:
-    """The unit in the name of a time, or the one `written` beside it, "" for none."""
+    """Returns the unit in the name of a time, or the one `written` beside it, "" for none."""
     unit = _time_unit(name)[1] or written.strip(" ()[]").casefold()
     return unit if unit in _PER_SECOND else ""
 
 
 def _in_days(interval: float) -> bool:
-    """Whether an interval is in days: up to 8 s, or whole seconds up to a minute. In seconds it would be
-    11 kHz, or a rate that no such machine has: 1 kHz would be 86.4 s."""
+    """Returns whether an interval is in days: up to 8 s, or whole seconds up to a minute. The same number in
+    seconds would mean 11 kHz or more, or a rate that no such machine has: 1 kHz would be 86.4 s."""
     in_seconds = interval * 86400
     return 0 < in_seconds < 8 or (in_seconds < 61 and abs(in_seconds - round(in_seconds)) < 0.02)
 
@@ -497,8 +503,8 @@ def _in_days(interval: float) -> bool:
 
 
 def forward(columns: FileColumns, notes: list[Note]) -> FileColumns:
-    """The columns from the oldest sample on. Columns with the newest first are reversed, which is noted;
-    nothing else is sorted."""
+    """Returns the columns with the oldest sample first. Columns with the newest sample first are reversed,
+    and this is noted. Nothing else is sorted."""
     last = len(columns.time) - 1
     if last < 1 or not (np.diff(columns.time) < 0).all():
         return columns
@@ -509,7 +515,7 @@ def forward(columns: FileColumns, notes: list[Note]) -> FileColumns:
 
 
 def every(time: str) -> float | None:
-    """The interval of "every 0.5 s", the time of a table without one; None for a column's name."""
+    """Returns the interval in "every 0.5 s", for a table without a time column; None for a column's name."""
     match = re.fullmatch(r"every\s+(\+?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*s", time.strip())
     interval = float(match[1]) if match else 0.0
     return interval if 0 < interval < np.inf else None
@@ -530,9 +536,9 @@ MOST_VALUES = 100_000_000
 class WholeTable(NamedTuple):
     """Numbers of n rows by name, with the unit that the file gives ("" for none).
 
-    `time` is the file's own clock, time_s (n,) or time_ns (n,) on a calendar, None if a column holds it.
-    `limits` are the lowest and highest value that the machine's own settings allow, by column.
-    `texts` are the columns that are no numbers, with what they hold.
+    `time`: the file's own clock, time_s (n,) or time_ns (n,) if the clock is a calendar's, None if a column
+    holds the time; `limits`: lowest and highest value that the machine's own settings allow, by column;
+    `texts`: columns that are not numbers, with what they hold.
     """
 
     values: dict[str, np.ndarray]
@@ -546,7 +552,7 @@ class WholeTable(NamedTuple):
     stamps: dict[str, np.ndarray]
 
     def columns(self) -> list[FileColumn]:
-        """The columns as `inspect` lists them."""
+        """Returns the columns as `inspect` lists them."""
         return [
             *(FileColumn(name, "number", self.units.get(name, "")) for name in self.values),
             *(FileColumn(name, "time", "") for name in self.stamps),
@@ -555,9 +561,10 @@ class WholeTable(NamedTuple):
 
 
 def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> tuple[FileColumns, list[Note]]:
-    """The wanted columns on the clock that `time` names: "" for the table's own, a column, or "every 1 s".
+    """Returns the wanted columns on the clock that `time` names ("" for the table's own, a column, or "every
+    1 s"), and notes.
 
-    Raises ValueError for a column that is missing or holds no numbers, and for a table without rows.
+    Raises ValueError if a column is missing or holds no numbers, or if the table has no rows.
     """
     names = [column.name for column in table.columns()]
     column_places(path, names, wanted)
@@ -584,7 +591,8 @@ def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> t
 def _clock(
     path: Path, table: WholeTable, names: Sequence[str], time: str, notes: list[Note]
 ) -> tuple[np.ndarray, str]:
-    """(time, zone) of the column that `time` names, or of the first with the name of a time."""
+    """Returns (time, zone) from the column that `time` names, or from the first column with the name of a
+    time."""
     if not time and table.stamps:
         # beside dates a temperature or a counter is no time
         called = [
@@ -606,7 +614,7 @@ def _clock(
 
 
 def check_values(path: Path, rows: int, columns: int) -> None:
-    """Raises ValueError for a table of more numbers than fit into memory."""
+    """Raises ValueError if a table has more numbers than are read into memory."""
     if rows * columns > MOST_VALUES:
         raise ValueError(
             f"{path}: {rows} rows of {columns} columns are more than the {MOST_VALUES} numbers "
@@ -615,7 +623,7 @@ def check_values(path: Path, rows: int, columns: int) -> None:
 
 
 def check_width(path: Path, count: int) -> None:
-    """Raises ValueError for a table of more columns than a machine has signals."""
+    """Raises ValueError if a table has more columns than a machine has signals."""
     if count > MOST_COLUMNS:
         raise ValueError(
             f"{path}: {count} columns are more than the {MOST_COLUMNS} that are read; "

@@ -1,15 +1,15 @@
-"""Pictures: the messages of an image topic and image files -> gray frames; the frames of a recording with the
-numbers beside them, read and written.
+"""Converts the messages of an image topic, and image files, to gray frames. Reads and writes recordings of
+frames with the numbers recorded beside them.
 
 The types read are sensor_msgs Image and CompressedImage in ROS 2 CDR and ROS 1, and Foxglove's RawImage and
 CompressedImage in protobuf, JSON (base64), CDR and ROS 1. Their layouts are fixed (ros2/common_interfaces,
-foxglove/foxglove-sdk), so that those of ROS need no schema text. A picture shares the memory of its message,
-and a mono8 frame that of its picture. Gray is luma, 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601), as in JPEG.
-16 bits stay 16 bits.
+foxglove/foxglove-sdk), so the ROS types need no schema text. A picture shares the memory of its message, and
+a mono8 frame shares the memory of its picture. Gray is luma, 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601), as
+in JPEG. 16 bits stay 16 bits.
 
-One walk checks a whole recording, reads the numbers and remembers the places of the pictures. Frames are
-decoded when they are iterated over. Any ROS 2 or Foxglove viewer opens what is written: CDR with the ros2msg
-texts embedded, in the order of time, chunks with CRCs. Equal input gives equal bytes.
+A recording is read once to check it, to read the numbers and to remember the offsets of the pictures. Frames
+are decoded later, when they are iterated over. Any ROS 2 or Foxglove viewer opens the files written here: CDR
+with the ros2msg texts embedded, in the order of time, in chunks with CRCs. Equal input gives equal bytes.
 """
 
 import base64
@@ -97,8 +97,8 @@ _LISTENING = threading.Lock()
 
 
 class ImageMessage(NamedTuple):
-    """A message's picture: `encoding` and the layout of its rows. With height 0 it is compressed, and
-    `encoding` is its format ("jpeg", "png")."""
+    """A message's picture: `encoding` and the layout of its rows. If height is 0, the picture is compressed
+    and `encoding` is its format ("jpeg", "png")."""
 
     stamp_ns: int
     encoding: str
@@ -113,7 +113,7 @@ Read = Callable[[bytes | memoryview], ImageMessage]
 
 
 def is_image(channel: Channel) -> bool:
-    """Whether the channel's messages are pictures that `reader` reads."""
+    """Returns whether the channel's messages are pictures that `reader` can read."""
     kind = _kind(channel)
     return (channel.encoding in ("cdr", "ros1") and kind in _ROS) or (
         channel.encoding in ("protobuf", "json") and kind in _FOXGLOVE
@@ -121,10 +121,11 @@ def is_image(channel: Channel) -> bool:
 
 
 def reader(channel: Channel) -> Read:
-    """A function from one message of the channel to its ImageMessage, without a copy and without decoding.
+    """Returns a function from one message of the channel to its ImageMessage. It neither copies nor decodes
+    the picture.
 
-    The function raises UnreadableMessage for a message that does not fit its type. Raises ValueError for a
-    channel without images.
+    The function raises UnreadableMessage if a message does not fit its type. Raises ValueError if the channel
+    has no images.
     """
     if not is_image(channel):
         raise ValueError(
@@ -153,7 +154,8 @@ def reader(channel: Channel) -> Read:
 
 
 def _kind(channel: Channel) -> str:
-    """ "sensor_msgs/Image" of sensor_msgs/msg/Image, sensor_msgs::msg::dds_::Image_ and the like."""
+    """Returns "sensor_msgs/Image" for sensor_msgs/msg/Image, sensor_msgs::msg::dds_::Image_ and similar
+    names."""
     parts = channel.schema_name.replace("::", "/").replace(".", "/").split("/")
     return f"{parts[0]}/{parts[-1].rstrip('_')}"
 
@@ -162,7 +164,7 @@ def _kind(channel: Channel) -> str:
 
 
 def _ros(message: memoryview, fields: list[tuple[str, ...]], aligned: bool) -> ImageMessage:
-    """The picture of a ROS message. ROS 2 is `aligned`; ROS 1 is not."""
+    """Returns the picture of a ROS message. ROS 2 is `aligned`; ROS 1 is not."""
     order, pos = "<", 0
     if aligned:
         order = _ORDERS.get(bytes(message[:2]), "")
@@ -225,8 +227,8 @@ def _picture(values: dict, stamp_ns: int) -> ImageMessage:
 
 
 def gray(picture: ImageMessage) -> np.ndarray:
-    """The gray frame (height, width), uint8 or uint16; of mono8 a view of the message. Raises
-    UnreadableMessage."""
+    """Returns the gray frame (height, width), uint8 or uint16. For mono8 it is a view of the message. Raises
+    UnreadableMessage if the picture cannot be decoded."""
     if not picture.height:
         frame = _decode_picture(picture.data, 0)
         if frame is None:
@@ -250,7 +252,7 @@ def gray(picture: ImageMessage) -> np.ndarray:
 
 
 def _rows(picture: ImageMessage, size: int) -> np.ndarray:
-    """(height, width size) bytes, without the padding at the end of each row."""
+    """Returns the bytes (height, width size), without the padding at the end of each row."""
     row = picture.width * size
     step = picture.step or row
     if picture.height < 1 or not 0 < row <= step or len(picture.data) < step * picture.height:
@@ -260,7 +262,7 @@ def _rows(picture: ImageMessage, size: int) -> np.ndarray:
 
 
 def _size(data: bytes) -> tuple[int, int]:
-    """Height and width by the header of a PNG or JPEG; (0, 0) if they do not stand in `data`."""
+    """Returns height and width from the header of a PNG or JPEG, (0, 0) if `data` does not contain them."""
     if data.startswith(b"\x89PNG") and len(data) >= 24:
         width, height = struct.unpack_from(">II", data, 16)
         return height, width
@@ -278,7 +280,8 @@ def _size(data: bytes) -> tuple[int, int]:
 
 
 def _decode_picture(data: bytes | memoryview, flags: int) -> np.ndarray | None:
-    """The gray picture of encoded bytes, None if there is none. Raises UnreadableMessage."""
+    """Returns the gray picture of encoded bytes, None if they cannot be decoded. Raises UnreadableMessage if
+    its header declares more than MOST_PIXELS."""
     height, width = _size(bytes(data[: 1 << 16]))
     if height * width > MOST_PIXELS:
         # they would take the memory before the first of them is read
@@ -296,8 +299,8 @@ def _decode_picture(data: bytes | memoryview, flags: int) -> np.ndarray | None:
 
 
 def read_image(path: str | Path) -> np.ndarray:
-    """The picture (height, width) in gray, uint8 or uint16, as the camera wrote it: a rotation noted
-    beside the pixels is not applied. Raises ValueError."""
+    """Returns the picture (height, width) in gray, uint8 or uint16, as the camera wrote it: a rotation noted
+    in the file is not applied. Raises ValueError if it cannot be read."""
     (picture,) = open_images([str(path)])
     if isinstance(picture, str):
         raise ValueError(
@@ -308,8 +311,8 @@ def read_image(path: str | Path) -> np.ndarray:
 
 
 def open_images(paths: Iterable[str]) -> Iterator[np.ndarray | str]:
-    """Each file's picture, or the reason why there is none; an empty path is a frame that is not looked
-    at."""
+    """Yields each file's picture, or the reason why it cannot be read. An empty path is a frame that is
+    skipped."""
     with _decoder_complaints() as complaint_of:
         for path in paths:
             frame: np.ndarray | str = MISSING
@@ -324,8 +327,8 @@ def open_images(paths: Iterable[str]) -> Iterator[np.ndarray | str]:
 
 
 def decode(data: bytes) -> np.ndarray:
-    """The picture (height, width) in gray, uint8 or uint16, of an encoded file.
-    Raises ValueError that says what was found instead."""
+    """Returns the picture (height, width) in gray, uint8 or uint16, of an encoded file. Raises ValueError,
+    which says what the bytes hold instead."""
     if not data:
         raise ValueError("an empty file")
     # a broken end is filled with gray: the end mark must follow the last scan
@@ -341,8 +344,8 @@ def decode(data: bytes) -> np.ndarray:
 
 @contextlib.contextmanager
 def _decoder_complaints() -> Iterator[Callable[[], str]]:
-    """A function that gives what the JPEG decoder has complained of since it was last asked: it mends what is
-    damaged, and says so on the process's error stream alone."""
+    """Gives a function that returns the JPEG decoder's complaint since its last call, "" if there is none.
+    The decoder repairs damaged data and reports this only on the error stream of the process."""
     at = 0
 
     def complaint_of() -> str:
@@ -373,13 +376,14 @@ def _decoder_complaints() -> Iterator[Callable[[], str]]:
 
 
 class Frames:
-    """(time_s, frame) of each picture in the order of time, frame (height, width) uint8 or uint16.
+    """Iterates over (time_s, frame) of each picture in the order of time; frame (height, width), uint8 or
+    uint16.
 
-    It can be walked again and again, in the memory of a chunk; time_s (n,) is there beforehand. The file of
-    `columns` is walked once before, for them too. A picture that cannot be decoded is left out:
-    `unreadable` counts those of the last walk, `notes` describes them. Raises ValueError if they are more
-    than `unreadable_share` of all, and if the size changes. `start_ns` is the instant from which time is
-    counted.
+    It can be iterated over any number of times, in the memory of one chunk; time_s (n,) is known before. The
+    file of `columns` is read once at the start, also for these columns. A picture that cannot be decoded is
+    left out: `unreadable` counts those of the last iteration, `notes` describes them. Raises ValueError if
+    they are more than `unreadable_share` of all, or if the size of the frames changes. `start_ns` is the
+    instant from which time is counted.
     """
 
     def __init__(self, columns: TopicColumns, topic: Topic, unreadable_share: float):
@@ -411,7 +415,8 @@ class Frames:
 
     @property
     def time_s(self) -> np.ndarray:
-        """Of the pictures (n,), the channels one behind the other in the order of their first pictures."""
+        """The times of the pictures (n,), one channel after the other in the order of their first
+        pictures."""
         return (self.time_ns - self.start_ns) / 1e9
 
     def __len__(self) -> int:
@@ -436,7 +441,7 @@ class Frames:
             yield time, frame
 
     def pictures(self) -> Iterator[tuple[float, ImageMessage]]:
-        """(time_s, ImageMessage) as they were recorded: encoded bytes, or rows."""
+        """Yields (time_s, ImageMessage) as recorded: encoded bytes, or rows."""
         self.unreadable, self._first = 0, ""
         with self.path.open("rb", buffering=0) as stream:
             for number, read, offsets in self._channels:
@@ -453,8 +458,8 @@ class Frames:
                         yield (time - self.start_ns) / 1e9, picture
 
     def pick(self, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
-        """(number, frame) of the pictures with these numbers; only they are decoded, and one that cannot be
-        decoded is left out."""
+        """Yields (number, frame) of the pictures with these numbers. Only these are decoded. A picture that
+        cannot be decoded is left out."""
         for number, (_, picture) in enumerate(self.pictures()):
             if number in numbers:
                 try:
@@ -463,7 +468,7 @@ class Frames:
                     continue
 
     def notes(self) -> list[Note]:
-        """What the last walk left out."""
+        """Returns a note on the pictures that the last iteration left out."""
         if not self.unreadable:
             return []
         return [
@@ -485,8 +490,8 @@ class Frames:
             )
 
     def _messages(self, stream: BinaryIO, number: int, offset: int) -> Iterator[tuple[int, int, memoryview]]:
-        """(log_time, publish_time, message) of the channel in the chunk or message at `offset`. The first
-        walk has checked its CRC."""
+        """Yields (log_time, publish_time, message) of the channel from the chunk or message at `offset`. The
+        CRC was checked when the file was first read."""
         try:
             stream.seek(offset)
             head = stream.read(9)
@@ -508,7 +513,8 @@ class Frames:
 
 
 def open_topics(path: Path, what: str) -> dict[str, Topic]:
-    """The topics of a recording; `what` it should hold. Raises ValueError for a table."""
+    """Returns the topics of a recording. Raises ValueError if the file is not MCAP; the message says `what`
+    it should be."""
     if file_format(path) != "mcap":
         raise ValueError(
             f"{path} is a table but {what} should be an MCAP recording with frames; name the recording"
@@ -517,8 +523,8 @@ def open_topics(path: Path, what: str) -> dict[str, Topic]:
 
 
 def image_topic(path: Path, topics: dict[str, Topic], name: str, place: str = "") -> Topic:
-    """The topic `name`, or, if `name` is empty, the only topic with images. Raises ValueError with the topics
-    that there are, and with the setting `place` that names one."""
+    """Returns the topic `name` or, if `name` is empty, the only topic with images. Raises ValueError with the
+    existing topics and with the setting `place` that names the image topic."""
     images = [topic for topic in topics.values() if topic.channels and all(map(is_image, topic.channels))]
     chosen = [topic for topic in images if not name or topic.name == name]
     if len(chosen) == 1:
@@ -551,12 +557,12 @@ def read_frames(
     optional: Collection[str] = (),
     section: str = "",
 ) -> tuple[Frames, dict[str, tuple[np.ndarray, np.ndarray]], dict[str, dict[str, str]], list[Note]]:
-    """Frames of the topic `image` (empty: the only one), the signals {name: (time_s (n,), values (n,))} of
-    `sources` on the same clock, metadata {record: {key: value}}, and notes on damage.
+    """Returns the frames of the topic `image` (empty: the only one), the signals {name: (time_s (n,), values
+    (n,))} of `sources` on the same clock, the metadata {record: {key: value}}, and notes on damage.
 
-    Signals that are `optional` may have no topic. Raises ValueError, which names `what` the recording should
-    be and the `section` of params.yaml that maps it, for a topic or field that is not there, if no picture
-    can be read, and if a clock runs backwards.
+    The `optional` signals may have no topic. Raises ValueError if a topic or field does not exist, if no
+    picture can be read, or if a clock runs backwards. The message names `what` the recording should be and
+    the `section` of params.yaml that maps it.
     """
     in_file = open_topics(path, what)
     if not any(topic.count for topic in in_file.values()):
@@ -610,7 +616,8 @@ def span_of(time_s: np.ndarray) -> tuple[float, float]:
 
 
 def _values(path: Path, source: Source, recorded: np.ndarray, notes: list[Note]) -> np.ndarray:
-    """The recorded values in the signal's unit. A missing value is NaN, and counted."""
+    """Returns the recorded values in the signal's unit. Missing values are NaN, and counted in a note. Raises
+    ValueError if all values are missing."""
     missing = int(np.count_nonzero(~np.isfinite(recorded)))
     if missing == len(recorded):
         raise ValueError(
@@ -630,9 +637,10 @@ def _values(path: Path, source: Source, recorded: np.ndarray, notes: list[Note])
 
 
 def _start(path: Path, groups: Sequence[FileColumns], notes: list[Note]) -> int:
-    """The instant in ns from which time is counted: 0, or the first whole second of a calendar.
+    """Returns the instant in ns from which time is counted: 0, or the first whole second if the clock is a
+    calendar's.
 
-    Every clock is checked to run forward.
+    Raises ValueError if a clock does not run forward.
     """
     for group in groups:
         check_clock(path, group)
@@ -645,7 +653,7 @@ def _start(path: Path, groups: Sequence[FileColumns], notes: list[Note]) -> int:
 
 
 def damage(path: Path) -> str:
-    """The damage that reading the whole file meets, in words."""
+    """Returns the damage found by reading the whole file, in words."""
     notes = McapFile(path).walk()
     return "; ".join(note.message for note in notes[:2]) or "it was closed before any message came"
 
@@ -671,12 +679,12 @@ _CDR = b"\x00\x01\x00\x00"
 
 
 def header(stamp_ns: int, frame_id: str) -> bytes:
-    """The beginning of a message with a std_msgs/Header: little-endian CDR."""
+    """Returns the beginning of a message with a std_msgs/Header: little-endian CDR."""
     return _CDR + struct.pack("<iI", *divmod(stamp_ns, 10**9)) + _text(frame_id)
 
 
 def image(head: bytes, frame: np.ndarray) -> bytes:
-    """sensor_msgs/msg/Image of a frame (height, width), uint8 (mono8) or uint16 (mono16)."""
+    """Returns a sensor_msgs/msg/Image of a frame (height, width), uint8 (mono8) or uint16 (mono16)."""
     height, width = frame.shape
     body = (
         _pad(head)
@@ -691,7 +699,7 @@ def image(head: bytes, frame: np.ndarray) -> bytes:
 
 
 def image_bytes(head: bytes, format: str, data: np.ndarray) -> bytes:
-    """sensor_msgs/msg/CompressedImage of encoded bytes (n,)."""
+    """Returns a sensor_msgs/msg/CompressedImage of encoded bytes (n,)."""
     return b"".join(
         [_pad(_pad(head) + _text(format)), struct.pack("<I", data.size), memoryview(data).cast("B")]
     )
@@ -708,7 +716,8 @@ def _pad(body: bytes) -> bytes:
 def tables_of(
     path: str | Path, time_s: np.ndarray, signals: Sequence[tuple[Source, np.ndarray]]
 ) -> dict[str, dict[str, np.ndarray]]:
-    """{topic: {field: values}}, checked."""
+    """Returns {topic: {field: values}}. Raises ValueError if a signal does not have one finite value for each
+    time, or if time does not run forward from 0 or later."""
     time = np.asarray(time_s, float)
     tables: dict[str, dict[str, np.ndarray]] = {}
     for name, values in [
@@ -746,10 +755,9 @@ def write_frames(
 ) -> None:
     """Writes one recording.
 
-    `tables` {topic: {field: (T,)}} are those of `tables_of`, `types` {topic: message type}, `pictures`
-    (encoding, frames (time_s, (height, width))). Frames are taken one by one, so that memory is that of a
-    chunk. Raises ValueError, with no file written, for an unknown encoding and for frames that
-    `_frame_messages` refuses.
+    `tables`: {topic: {field: (T,)}} from `tables_of`; `types`: {topic: message type}; `pictures`: (encoding,
+    frames (time_s, (height, width))). Frames are taken one by one, so only one chunk is in memory. Raises
+    ValueError, and writes no file, if the encoding is unknown or `_frame_messages` refuses the frames.
     """
     if pictures and pictures[0] not in ENCODERS:
         raise ValueError(
@@ -803,8 +811,8 @@ def _signal_messages(
 def _frame_messages(
     path, channel: int, encoding: str, frames: Iterable, span: tuple[float, float]
 ) -> Iterator[tuple[int, int, bytes]]:
-    """CDR messages of the frames. Each frame is checked, and at the end the overlap with the signals'
-    time."""
+    """Yields the CDR messages of the frames. Checks each frame and, at the end, the overlap with the signals'
+    time. Raises ValueError if a check fails."""
     ending, settings = ENCODERS[encoding]
     kind, last, first = None, -1, math.nan
     for k, (time, frame) in enumerate(frames):

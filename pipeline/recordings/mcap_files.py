@@ -1,9 +1,10 @@
-"""MCAP files and ROS 2 bags of them: the walk through the records, the topics, and their numbers as columns.
+"""Reads MCAP files, and ROS 2 bags made of them: the records, the topics, and the topics' numbers as columns.
 
-Layout: mcap.dev/spec. Whole chunks are read; damaged ones are left out, counted and named by their offset.
-Definitions are parsed by the mcap package. The walk is ours: the package's readers stop at the first damage
-(in a file with one bad chunk in the middle 758 of 1500 messages came out, here 1446), its reader with an
-index gives nothing of a file that was cut off, and both take 4 to 11 us a message, this one 0.5 us.
+Layout: mcap.dev/spec. Only whole chunks are read. Damaged ones are left out, counted and reported with their
+offset. The mcap package parses the definitions. The loop over the records is our own for three reasons. The
+package's readers stop at the first damage (in a file with one bad chunk in the middle they read 758 of 1500
+messages, this one 1446). Its reader that uses the index reads nothing from a file that was cut off. And both
+need 4 to 11 us for a message, this one 0.5 us.
 """
 
 import contextlib
@@ -101,8 +102,8 @@ def _note(name: str, count: int = 1, **values: Any) -> Note:
 
 
 class Messages(NamedTuple):
-    """Messages of one channel in the order of the file: times in ns, the bytes of each (none for a channel
-    that is not wanted), and the offsets of the chunks, or of the single messages, that hold them."""
+    """Messages of one channel in the order of the file: times in ns, the bytes of each message (empty if the
+    channel is not wanted), and the offsets of the chunks, or of the single messages, that hold them."""
 
     log_time: list[int]
     publish_time: list[int]
@@ -133,7 +134,8 @@ def check_magic(path: Path, start: bytes) -> None:
 
 
 class _Whole(ReadDataStream):
-    """The package's stream gives less than it should at the end of the bytes; this one refuses to."""
+    """A stream that raises EndOfFile at the end of the bytes. The package's stream returns fewer bytes than
+    requested."""
 
     def read(self, length: int) -> bytes:
         data = super().read(length)
@@ -143,7 +145,7 @@ class _Whole(ReadDataStream):
 
 
 def _parse(kind: Any, body: bytes) -> Any:
-    """The package's record of a body. Raises UnreadableMessage for lengths that do not agree."""
+    """Returns the package's record of a body. Raises UnreadableMessage if its lengths do not agree."""
     try:
         return kind.read(_Whole(io.BytesIO(body)))
     except (EndOfFile, UnicodeDecodeError):
@@ -151,8 +153,8 @@ def _parse(kind: Any, body: bytes) -> Any:
 
 
 def _split_records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(opcode, body) of records one behind the other. Raises UnreadableMessage for a record that runs over
-    the end."""
+    """Yields (opcode, body) of consecutive records. Raises UnreadableMessage if a record runs over the
+    end."""
     pos = 0
     while pos < len(data):
         opcode, length = RECORD_HEAD.unpack_from(data, pos)
@@ -163,9 +165,9 @@ def _split_records(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def unpack_chunk(body: bytes, *, check: bool = True) -> tuple[bytes, int]:
-    """The records of a chunk, and where in the bytes they begin: copying what is not packed would take as
-    long as its CRC. Raises UnreadableMessage for another size than it says, and, with `check`, another
-    CRC."""
+    """Returns the bytes that hold a chunk's records, and the position in them at which the records begin. (A
+    chunk that is not compressed is not copied: that would take as long as its CRC.) Raises UnreadableMessage
+    if the size differs from the declared one or, with `check`, if the CRC differs."""
     _, _, size, crc, length = CHUNK_HEAD.unpack_from(body)
     start = CHUNK_HEAD.size + length + 8
     method = body[CHUNK_HEAD.size : start - 8].decode()
@@ -181,7 +183,8 @@ def unpack_chunk(body: bytes, *, check: bool = True) -> tuple[bytes, int]:
 
 
 def _next_chunk(stream: BinaryIO, offset: int) -> int | None:
-    """Offset of the next chunk from `offset` on whose lengths agree, None if there is none."""
+    """Returns the offset of the next chunk from `offset` on with lengths that agree, None if there is
+    none."""
     size = stream.seek(0, 2)
     if offset >= size:
         return None
@@ -194,9 +197,9 @@ def _next_chunk(stream: BinaryIO, offset: int) -> int | None:
 
 
 class _Walk:
-    """A walk through the records of a file, with the schemas and channels that were met so far, and the
-    metadata records {name: {key: value}}. `offset` is that of the first byte that was not read. A walk that
-    `waits` ends where the file ends in a record; any other leaves that record out."""
+    """Reads the records of a file in order. Keeps the schemas and channels read so far, and the metadata
+    records {name: {key: value}}. `offset`: offset of the first byte not yet read. If the file ends inside a
+    record, a walk that `waits` stops before that record and any other walk leaves it out."""
 
     waits = False
 
@@ -207,12 +210,13 @@ class _Walk:
         self.metadata: dict[str, dict[str, str]] = {}
 
     def leave_out(self, offset: int, reason: str, chunk: bytes, resumed: int | None) -> None:
-        """Takes note of damage at `offset`: its reason, what can be read of a chunk's record there, and the
-        offset of the next chunk, None if there is none."""
+        """Records damage at `offset`. `reason`: why; `chunk`: the bytes of a chunk's record there that can be
+        read; `resumed`: offset of the next chunk, None if there is none."""
         raise NotImplementedError
 
     def define(self, opcode: int, body: bytes) -> None:
-        """Remembers a definition; other records are passed over. Raises UnreadableMessage."""
+        """Keeps a schema, channel or metadata record and ignores other records. Raises UnreadableMessage if a
+        schema or a channel cannot be read."""
         if opcode == Opcode.SCHEMA:
             schema = _parse(records.Schema, body)
             self.schemas[schema.id] = (schema.name, schema.encoding, schema.data)
@@ -226,7 +230,7 @@ class _Walk:
                 self.metadata[metadata.name] = metadata.metadata
 
     def records(self, stream: BinaryIO) -> Iterator[tuple[int, int, bytes, bytes]]:
-        """(opcode, offset, head, body) of the records. Behind damage it goes on at the next chunk."""
+        """Yields (opcode, offset, head, body) of the records. After damage it continues at the next chunk."""
         stream.seek(self.offset)
         while self.offset < self.size:
             offset, head, body = self.offset, stream.read(9), b""
@@ -252,7 +256,7 @@ class _Walk:
             self.offset = stream.seek(resumed)
 
     def _unsound_head(self, head: bytes) -> str:
-        """The reason why no whole record begins with this head, "" if one does."""
+        """Returns the reason why no whole record begins with this head, "" if one does."""
         if len(head) < RECORD_HEAD.size:
             return ENDS
         opcode, length = RECORD_HEAD.unpack(head)
@@ -265,8 +269,8 @@ class _Walk:
         return ENDS if self.offset + 9 + length > self.size else ""
 
     def _unsound_body(self, opcode: int, body: bytes) -> str:
-        """The reason why the lengths inside do not agree with the record's own, "" if they do. If they do
-        not, the next record is not where it seems."""
+        """Returns the reason why the lengths inside a record do not agree with the record's own length, "" if
+        they do. If they do not agree, the next record may begin elsewhere."""
         sound = True
         try:
             if opcode == CHUNK:
@@ -284,8 +288,8 @@ class _Walk:
 
 
 class McapFile(_Walk):
-    """Walks a file once and remembers schemas, channels, counts and damage. Raises ValueError for a file that
-    is no MCAP."""
+    """Reads a file once and keeps its schemas, channels, counts and damage. Raises ValueError if the file is
+    not MCAP."""
 
     def __init__(self, path: Path):
         super().__init__(path)
@@ -343,8 +347,8 @@ class McapFile(_Walk):
     # ---- the data
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[dict[int, Messages]]:
-        """{channel: Messages} of each chunk, or of a megabyte of messages outside chunks. Only wanted
-        channels come with data."""
+        """Yields {channel: Messages} for each chunk, and for each megabyte of messages outside chunks. Only
+        wanted channels come with data."""
         with self.path.open("rb", buffering=1 << 16) as stream:
             crc, group, grouped = zlib.crc32(MAGIC), {}, 0
             for opcode, offset, head, record in self.records(stream):
@@ -372,7 +376,7 @@ class McapFile(_Walk):
                 yield group
 
     def walk(self) -> list[Note]:
-        """What `notes` gives of the whole file, without any message."""
+        """Reads the whole file without returning messages and returns its `notes`."""
         for _ in self.batches(lambda channel: False):
             pass
         return self.notes()
@@ -389,7 +393,7 @@ class McapFile(_Walk):
     def _chunk(
         self, offset: int, record: bytes, wanted: Callable[[Channel], bool]
     ) -> dict[int, Messages] | None:
-        """The messages of a chunk, None if it is damaged."""
+        """Returns the messages of a chunk, None if it is damaged."""
         first, last, _, crc, _ = CHUNK_HEAD.unpack_from(record)
         batch: dict[int, Messages] = {}
         try:
@@ -418,8 +422,8 @@ class McapFile(_Walk):
         wanted: Callable[[Channel], bool],
         batch: dict[int, Messages],
     ) -> None:
-        """Sorts the records in data[begin:], of the chunk or message at `offset`, by channel into `batch`.
-        Raises UnreadableMessage for a record that runs over the end."""
+        """Adds the records in data[begin:] to `batch`, by channel. They belong to the chunk or message at
+        `offset`. Raises UnreadableMessage if a record runs over the end."""
         pos, end, unpack = begin, len(data), MESSAGE_HEAD.unpack_from
         current, messages, has_data = -1, Messages([], [], [], []), False
         while pos < end:
@@ -447,7 +451,7 @@ class McapFile(_Walk):
             pos = following
 
     def _count(self, batch: dict[int, Messages]) -> tuple[int, int] | None:
-        """Counts the messages; their first and last time, None if there are none."""
+        """Counts the messages. Returns their first and last time, None if there are no messages."""
         times = []
         for number, messages in batch.items():
             self.counts[number] = self.counts.get(number, 0) + len(messages.log_time)
@@ -471,7 +475,8 @@ class McapFile(_Walk):
         self.remarks.append(_note("data", actual=actual, expected=expected))
 
     def notes(self) -> list[Note]:
-        """Damage and its extent. It is complete when the batches have been walked."""
+        """Returns notes on damage and how much is lost. They are complete only after all batches were
+        read."""
         notes = []
         for offset, reason in self.damage.items():
             count = self.lost.get(offset)
@@ -497,8 +502,8 @@ class McapFile(_Walk):
         return notes + self._cut(total, max(lost, promised - total))
 
     def _cut(self, total: int, lost: int) -> list[Note]:
-        """A note with the share of the recording that is lost: of its messages if the file counts them, else
-        of its time, as the heads of the lost chunks say."""
+        """Returns a note with the share of the recording that is lost: the share of its messages if the file
+        counts them, otherwise the share of its time, from the heads of the lost chunks."""
         what = "messages are lost"
         if not lost and self.span_ns:
             begin_ns, end_ns = self.span_ns
@@ -523,11 +528,11 @@ class Message(NamedTuple):
 
 
 class GrowingMcap(_Walk):
-    """The whole records of a file so far, and those that come. A recorder closes a chunk every second or so,
-    and writes the footer last. What is not whole yet is left for the next look; a file that was begun anew is
-    read from its start.
+    """Reads a file that is still being written: its whole records so far, then those that are added. A
+    recorder closes a chunk about every second and writes the footer last. A record that is not yet complete
+    is left for the next call. If the file was started anew, it is read from its start.
 
-    `ended` says whether the footer was met; `damage` has sentences.
+    `ended`: whether the footer was read; `damage`: sentences.
     """
 
     waits = True
@@ -542,8 +547,8 @@ class GrowingMcap(_Walk):
             self.damage.append(f"{self.path}: the chunk or record at byte {offset} was left out ({reason})")
 
     def messages(self, wanted: Callable[[Channel], bool]) -> Iterator[Message]:
-        """The messages that came since the last look, of wanted channels. Raises FileNotFoundError if there
-        is no such file, and ValueError if it is no MCAP."""
+        """Yields the messages of wanted channels that were added since the last call. Raises
+        FileNotFoundError if the file does not exist, and ValueError if it is not MCAP."""
         with self.path.open("rb", buffering=1 << 16) as stream:
             status = os.fstat(stream.fileno())
             if (self.inode and self.inode != status.st_ino) or status.st_size < min(self.offset, self.size):
@@ -582,8 +587,8 @@ class GrowingMcap(_Walk):
 
 
 class Topic(NamedTuple):
-    """A topic: its channels, the fields with numbers, the reason if it cannot be read, and the count of its
-    messages."""
+    """A topic: its channels, the fields that hold numbers, the reason if it cannot be read, and the number of
+    its messages."""
 
     name: str
     channels: list[Channel]
@@ -593,7 +598,7 @@ class Topic(NamedTuple):
 
 
 def merge_topics(parts: Iterable[dict[str, Topic]]) -> dict[str, Topic]:
-    """The topics of all parts."""
+    """Returns the topics of all parts; a topic of several parts is merged into one."""
     union: dict[str, Topic] = {}
     for topic in itertools.chain.from_iterable(part.values() for part in parts):
         earlier = union.get(topic.name, Topic(topic.name, [], [], "", 0))
@@ -608,9 +613,9 @@ def merge_topics(parts: Iterable[dict[str, Topic]]) -> dict[str, Topic]:
 
 
 def topics(path: Path, samples: int = SAMPLES) -> dict[str, Topic]:
-    """The topics of a file, by its summary and the first `samples` messages of each channel.
+    """Returns the topics of a file, from its summary and the first `samples` messages of each channel.
 
-    Raises ValueError for a file that is no MCAP.
+    Raises ValueError if the file is not MCAP.
     """
     file, names, unreadable, counts = McapFile(path), {}, {}, {}
 
@@ -648,8 +653,8 @@ def topics(path: Path, samples: int = SAMPLES) -> dict[str, Topic]:
 
 
 def resolve(path: Path, source: str, topics: dict[str, Topic]) -> tuple[str, str]:
-    """(topic, field) of "/topic:field", or of a field's bare name that only one topic has. Raises ValueError
-    with the nearest names."""
+    """Returns (topic, field) of "/topic:field", or of a field's name alone if only one topic has it. Raises
+    ValueError with the nearest names."""
     for topic in topics.values():
         if source.startswith(f"{topic.name}:"):
             field = source[len(topic.name) + 1 :]
@@ -674,7 +679,7 @@ def resolve(path: Path, source: str, topics: dict[str, Topic]) -> tuple[str, str
 
 
 class TopicColumns:
-    """The wanted numbers of topics, which grow batch by batch while their file is walked.
+    """The wanted numbers of topics. They grow batch by batch while their file is read.
 
     The clock is log_time, or publish_time, or a field of each topic such as header.stamp.
     """
@@ -689,8 +694,9 @@ class TopicColumns:
         self.backwards: dict[str, int] = {}
 
     def want(self, topic: Topic, names: Sequence[str]) -> None:
-        """Takes the fields `names` of a topic from now on, and those that make its clock: none for log_time
-        and publish_time, one of seconds, or two of a stamp. Raises ValueError if it lacks them."""
+        """Adds the fields `names` of a topic, and the fields of its clock: none for log_time and
+        publish_time, otherwise one field in seconds or the two fields of a time stamp. Raises ValueError if
+        the topic has no such clock."""
         self.fields[topic.name] = list(dict.fromkeys(names))
         candidates = [[]] if self.time in ("", "log_time", "publish_time") else [[self.time]]
         candidates += [[f"{self.time}.{part}" for part in parts] for parts in _STAMPS]
@@ -705,7 +711,7 @@ class TopicColumns:
         self.clocks[topic.name] = clock
 
     def add(self, number: int, messages: Messages) -> None:
-        """Decodes messages of a channel. Raises ValueError for a field that it lacks, and for text in place
+        """Decodes messages of a channel. Raises ValueError if the channel lacks a field, or has text instead
         of a number."""
         channel = self.file.channels.get(number)
         if channel is None or channel.topic not in self.fields or not messages.data:
@@ -738,8 +744,9 @@ class TopicColumns:
         self.backwards[topic] = self.backwards.get(topic, 0) + back
 
     def join(self, topic: str, notes: list[Note]) -> FileColumns:
-        """The topic's channels one behind the other. Two channels at the same time are two devices under one
-        name, and refused."""
+        """Returns the columns of a topic, with its channels one after the other. Raises ValueError if two
+        channels overlap in time, because they are two devices under one name, and if no message could be
+        read."""
         path, pieces = self.file.path, []
         for number in [number for number in self.parts if self.file.channels[number].topic == topic]:
             time, *values = self.parts.pop(number).finished()
@@ -769,7 +776,7 @@ class TopicColumns:
         return columns._replace(name=topic, place=lambda i: f"message {i + 1} of {topic}")
 
     def notes(self) -> list[Note]:
-        """Notes of the messages that do not fit their schema."""
+        """Returns notes on the messages that do not fit their schema."""
         sentence = "{} messages of {} are not what its schema says and were left out"
         return [
             Note("unreadable", "", count, sentence.format(count, topic))
@@ -784,7 +791,8 @@ def join_parts(
     overlap: str = "two parts of the bag hold {first} at the same time; "
     "name the part in metadata.yaml that is to be read",
 ) -> FileColumns:
-    """One topic's columns of several parts or channels. Raises ValueError for those that overlap in time."""
+    """Returns one topic's columns from several parts or channels. Raises ValueError if they overlap in
+    time."""
     groups = sorted(groups, key=lambda group: group.time.min())
     for first, second in itertools.pairwise(groups):
         if second.time.min() <= first.time.max():
@@ -796,7 +804,7 @@ def join_parts(
 
 
 def _stamps(clock: Sequence[str], stamps: np.ndarray) -> np.ndarray:
-    """Times in ns (n,) of the clock's fields (n, 1 or 2)."""
+    """Returns the times in ns (n,) from the values of the clock's fields (n, 1 or 2)."""
     if len(clock) == 1:
         return np.rint(seconds(clock[0].rpartition(".")[2], stamps[:, 0])[0] * 1e9).astype(np.int64)
     # both parts are whole numbers below 2^53, so that floats hold them and the nanoseconds are exact
@@ -805,7 +813,8 @@ def _stamps(clock: Sequence[str], stamps: np.ndarray) -> np.ndarray:
 
 
 def _decode(decode: Decode, data: list[bytes], width: int) -> tuple[np.ndarray, slice | list[int]]:
-    """Numbers (n, width) of the messages that fit their schema, and which ones they are."""
+    """Returns the numbers (n, width) of the messages that fit their schema, and the indices of these
+    messages."""
     with contextlib.suppress(UnreadableMessage):
         return decode([plain(message) for message in data]), slice(None)
     rows, sound = [np.empty((0, width))], []
@@ -817,7 +826,7 @@ def _decode(decode: Decode, data: list[bytes], width: int) -> tuple[np.ndarray, 
 
 
 def _topic_counts(file: McapFile) -> dict[str, int]:
-    """{topic: count of the messages that were read}."""
+    """Returns {topic: number of messages read}."""
     counts: dict[str, int] = {}
     for number, count in file.counts.items():
         topic = file.channels[number].topic if number in file.channels else f"channel {number}"
@@ -828,11 +837,11 @@ def _topic_counts(file: McapFile) -> dict[str, int]:
 def mcap_columns(
     path: Path, sources: Sequence[str], time: str
 ) -> tuple[list[FileColumns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
-    """The columns of each topic that `sources` need, {source: (topic, field)}, {topic: count of its
+    """Returns the columns of each topic that `sources` need, {source: (topic, field)}, {topic: number of its
     messages}, and notes.
 
     The clock is log_time, or publish_time, or a field of each topic such as header.stamp. Raises ValueError
-    for a source that is not there, and for a topic without a whole chunk.
+    if a source does not exist, or if no message of a topic can be read.
     """
     places, by_name = _places(path, sources)
     file = McapFile(path)
@@ -855,7 +864,7 @@ def mcap_columns(
 
 
 def _places(path: Path, sources: Sequence[str]) -> tuple[dict[str, tuple[str, str]], dict[str, Topic]]:
-    """{source: (topic, field)}, and {name: topic}."""
+    """Returns {source: (topic, field)} and {name: topic}."""
     by_name = topics(path)
     if not any(topic.fields for topic in by_name.values()):
         reasons = [f"{topic.name}: {topic.unreadable}" for topic in by_name.values() if topic.unreadable]
@@ -874,7 +883,8 @@ def _places(path: Path, sources: Sequence[str]) -> tuple[dict[str, tuple[str, st
 
 
 class Survey(NamedTuple):
-    """Every topic of a file, the columns of those with numbers, and notes on damage and on what is unread."""
+    """All topics of a file, the columns of the topics with numbers, and notes on damage and on unread
+    topics."""
 
     topics: dict[str, Topic]
     columns: list[FileColumns]
@@ -882,10 +892,10 @@ class Survey(NamedTuple):
 
 
 def survey(path: Path, most_fields: int) -> Survey:
-    """The topics of a file with the first `most_fields` numbers of each on log_time: one look at the first
-    messages, and one walk.
+    """Returns the topics of a file with the first `most_fields` numbers of each, on log_time. It reads the
+    first messages once and then the whole file once.
 
-    Raises ValueError for a file that is no MCAP.
+    Raises ValueError if the file is not MCAP.
     """
     by_name, file, failures = topics(path), McapFile(path), {}
     columns = TopicColumns(file, "")
@@ -916,9 +926,9 @@ def survey(path: Path, most_fields: int) -> Survey:
 
 
 def bag_parts(path: Path) -> list[Path]:
-    """The MCAP files of a bag, in the order of its metadata.
+    """Returns the MCAP files of a bag, in the order of its metadata.
 
-    Raises ValueError for metadata that cannot be read, another storage, and a part that is missing.
+    Raises ValueError if the metadata cannot be read, if the storage is not MCAP, or if a part is missing.
     """
     file = path / METADATA
     if file.stat().st_size > LARGEST_METADATA:
@@ -952,7 +962,7 @@ def bag_parts(path: Path) -> list[Path]:
 
 
 def _text(value: object) -> str:
-    """A text of the metadata. Raises TypeError for anything else, which may be as large as it likes."""
+    """Returns a text of the metadata. Raises TypeError for anything else, which may be of any size."""
     if not isinstance(value, str):
         raise TypeError("no text")
     return value
@@ -961,7 +971,7 @@ def _text(value: object) -> str:
 def read_bag(
     path: Path, sources: Sequence[str], time: str
 ) -> tuple[list[FileColumns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
-    """What `mcap_columns` gives, of all parts of a bag one behind the other."""
+    """Returns the same as `mcap_columns`, for all parts of a bag one after the other."""
     parts = bag_parts(path)
     by_part = [topics(part) for part in parts]
     union = merge_topics(by_part)
@@ -989,8 +999,8 @@ def read_bag(
 
 
 def _pauses(pieces: dict[str, list[FileColumns]]) -> list[Note]:
-    """A note if parts of a bag stand farther apart than they last: a recorder goes on at once in the next
-    part."""
+    """Returns a note if two parts of a bag are farther apart in time than the two of them last. A recorder
+    continues at once in the next part."""
     for topic, groups in pieces.items():
         spans = sorted((group.time[0].item(), group.time[-1].item()) for group in groups)
         for (first, end), (begin, last) in itertools.pairwise(spans):

@@ -1,12 +1,12 @@
-"""Numbers of the messages of an MCAP channel in ROS 2 CDR, ROS 1, protobuf or JSON. A message may be
-compressed by itself.
+"""Decodes the numbers in the messages of an MCAP channel: ROS 2 CDR, ROS 1, protobuf or JSON. A single
+message may be compressed.
 
-A ROS message definition becomes a short program of struct formats, made once and run for each message, in a
-sixth of the time of the mcap-ros2-support package. ROS 2 writes CDR (OMG DDSI-RTPS 10.2, "classic CDR", and
-XCDR2 for final types), aligned to the size of each number behind a header of four bytes. ROS 1 has no header
-and no alignment. Sequences and text begin with their length (uint32). Text is skipped; fields behind a wide
-text cannot be read. Protobuf is decoded by the official package, by types made of the schema's
-FileDescriptorSet.
+A ROS message definition is converted once to a short program of struct formats, which is run for each
+message. It takes a sixth of the time of the mcap-ros2-support package. ROS 2 writes CDR (OMG DDSI-RTPS 10.2,
+"classic CDR", and XCDR2 for final types): a header of four bytes, then numbers aligned to their size. ROS 1
+has no header and no alignment. Sequences and text begin with their length (uint32). Text is skipped. Fields
+after a wide text cannot be read. Protobuf is decoded by the official package, with types made from the
+schema's FileDescriptorSet.
 """
 
 import contextlib
@@ -55,7 +55,7 @@ class UnreadableMessage(ValueError):
 
 
 class Channel(NamedTuple):
-    """A channel of the file with its schema and the writer's metadata."""
+    """A channel of the file, with its schema and the writer's metadata."""
 
     id: int
     topic: str
@@ -67,9 +67,9 @@ class Channel(NamedTuple):
 
 
 def fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
-    """Paths of the numbers in the channel's messages, by its schema and a few of its messages.
+    """Returns the paths of the numbers in the channel's messages, from its schema and a few of its messages.
 
-    Raises ValueError with the reason for messages that cannot be read.
+    Raises ValueError with the reason if the messages cannot be read.
     """
     kind = _kind(channel)
     samples = [plain(sample) for sample in samples]
@@ -83,10 +83,10 @@ def fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
 
 
 def decoder(channel: Channel, names: Sequence[str]) -> Decode:
-    """A function from n messages to their numbers (n, len(names)), NaN for a number that a message lacks.
+    """Returns a function from n messages to their numbers (n, len(names)), NaN if a message lacks a number.
 
-    It raises UnreadableMessage for a message that does not fit its channel, and ValueError for text in place
-    of a wanted number.
+    The function raises UnreadableMessage if a message does not fit its channel, and ValueError if a wanted
+    number is text.
     """
     kind = _kind(channel)
     if kind == "json":
@@ -117,18 +117,19 @@ def _kind(channel: Channel) -> str:
 
 
 def plain(message: bytes) -> bytes:
-    """The message, decompressed if it is a zstd or lz4 frame, as rosbag2 writes with compression mode
-    `message`."""
+    """Returns the message, decompressed if it is a zstd or lz4 frame (rosbag2 writes these in compression
+    mode `message`)."""
     if message[:4] not in (_ZSTD, _LZ4):
         return message
     return decompress("zstd" if message[:4] == _ZSTD else "lz4", message, None)
 
 
 def decompress(method: str, data: bytes, size: int | None) -> bytes:
-    """The bytes of a zstd or lz4 frame; `size` is their count, or None. Raises UnreadableMessage for a
-    damaged frame.
+    """Returns the bytes of a zstd or lz4 frame; `size` is their count, or None if not known. Raises
+    UnreadableMessage if the frame is damaged.
 
-    The size that a zstd frame declares is checked first: after one flipped bit it may ask for terabytes.
+    The size that a zstd frame declares is checked first, because after one flipped bit it may declare
+    terabytes.
     """
     room = LARGEST_MESSAGE if size is None else size
     try:
@@ -154,7 +155,8 @@ def decompress(method: str, data: bytes, size: int | None) -> bytes:
 
 
 def _document(message: bytes):
-    """The message's value. orjson is four times as fast as json, which also knows NaN and Infinity."""
+    """Returns the message's value. orjson is four times as fast as json, but only json reads NaN and
+    Infinity. Raises UnreadableMessage if the message is not JSON."""
     try:
         return orjson.loads(message)
     except orjson.JSONDecodeError:
@@ -165,7 +167,7 @@ def _document(message: bytes):
 
 
 def _json_fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
-    """Paths of the numbers that a JSON schema promises, and of those in the messages."""
+    """Returns the paths of the numbers that a JSON schema declares, and of the numbers in the messages."""
     names: dict[str, None] = {}
     if channel.schema_encoding == "jsonschema" and channel.schema:
         with contextlib.suppress(UnreadableMessage):  # the messages tell
@@ -192,7 +194,8 @@ def _schema_paths(schema, prefix: str, depth: int) -> Iterator[str]:
 
 
 def _paths(value, prefix: str = "", depth: int = 0) -> Iterator[str]:
-    """Paths of the numbers in a value. Null counts, as another message may have a number there."""
+    """Yields the paths of the numbers in a value. Null counts too, because another message may have a number
+    there."""
     if isinstance(value, int | float) or (value is None and prefix):
         yield prefix
     elif isinstance(value, dict) and depth < 8:
@@ -239,8 +242,8 @@ def _value(document, name: str, steps: tuple) -> float:
 
 
 def _by_prefix(document, name: str):
-    """The value of a path whose keys hold dots themselves, such as {"heater.1": 30}; None if there is
-    none."""
+    """Returns the value of a path if keys themselves contain dots, such as {"heater.1": 30}; None if it does
+    not exist."""
     if not isinstance(document, dict):
         return None
     if name in document:
@@ -286,8 +289,8 @@ _LENGTH = {order: struct.Struct(order + "I") for order in "<>"}
 
 
 class Item(NamedTuple):
-    """A stretch of the layout: `count` numbers of one `format`, text, or a sequence of `items` (an empty
-    sequence of numbers has one item of count 1). The paths of a sequence's items hold [] for the index."""
+    """A part of the layout: `count` numbers of one `format`, text, or a sequence of `items` (a sequence of
+    numbers has one item of count 1). The paths of a sequence's items contain [] for the index."""
 
     kind: str
     path: str
@@ -305,9 +308,10 @@ def _layout(channel: Channel, version: int) -> list[Item]:
 
 
 def ros_layout(definition: str, name: str, *, version: int) -> list[Item]:
-    """The message's numbers, texts and sequences in the order of the wire. `version` is 1 or 2.
+    """Returns the message's numbers, texts and sequences in the order in which they are transmitted.
+    `version`: 1 or 2.
 
-    Raises ValueError for a definition that cannot be read.
+    Raises ValueError if the definition cannot be read.
     """
     if re.search(r"^---", definition, re.MULTILINE):
         raise ValueError(f"the schema of {name} is a service's (---), not a message's")
@@ -315,7 +319,8 @@ def ros_layout(definition: str, name: str, *, version: int) -> list[Item]:
 
 
 def _types(definition: str, name: str) -> dict[str, list[tuple[str, str, str | None]]]:
-    """{type: [(field, its type, None | "" | length)]}; "" is a sequence without a fixed length."""
+    """Returns {type: [(field, its type, length)]}. The length is None for a single value and "" for a
+    sequence without a fixed length."""
     parts = re.split(r"^={3,}\s*$", definition, flags=re.MULTILINE)
     texts = dict(KNOWN) | {_plain(name): parts[0]}
     for part in parts[1:]:
@@ -354,7 +359,8 @@ def _resolve(kind: str, parent: str, types: dict) -> str:
 
 
 def _expand(kind: str, prefix: str, types: dict, version: int, room: list[int]) -> list[Item]:
-    """The items of a type, in the order of the wire; `room` is how many more there may be."""
+    """Returns the items of a type, in the order in which they are transmitted. `room`: how many more items
+    are allowed."""
     items: list[Item] = []
     numbers = ROS2_NUMBERS if version == 2 else ROS1_NUMBERS
     for field, part_kind, length in types[kind]:
@@ -400,7 +406,8 @@ def _element(element: str, path: str, parent: str, types: dict, version: int, ro
 
 
 def ros_fields(items: Sequence[Item], sample: bytes | None, *, version: int) -> list[str]:
-    """Paths of the numbers. Of a sequence they are those of the message `sample`, up to LONGEST_LISTED."""
+    """Returns the paths of the numbers. For a sequence they are those in the message `sample`, up to
+    LONGEST_LISTED."""
     names: list[str] = []
     lists: dict[str, list[str]] = {}
     for item in _readable(items):
@@ -417,8 +424,8 @@ def ros_fields(items: Sequence[Item], sample: bytes | None, *, version: int) -> 
 def _elements(
     lists: dict[str, list[str]], sample: bytes | None, make_decoder: Callable[[list[str]], Decode]
 ) -> list[str]:
-    """Paths of the numbers in the lists of a message {path: [path below each element]}, up to
-    LONGEST_LISTED."""
+    """Returns the paths of the numbers in a message's lists, up to LONGEST_LISTED elements each. `lists`:
+    {path of the list: [path below each element]}."""
     if sample is None or not lists:
         return []
     try:
@@ -434,7 +441,8 @@ def _elements(
 
 
 def _readable(items: Sequence[Item]) -> list[Item]:
-    """The items up to the first wide text, as writers do not agree on the length of its characters."""
+    """Returns the items up to the first wide text, because writers do not agree on the length of its
+    characters."""
     for i, item in enumerate(items):
         if item.kind == "wstring" or (
             item.kind == "sequence" and len(_readable(item.items)) < len(item.items)
@@ -452,8 +460,8 @@ Step = tuple[list[str], Callable[[bytes, int, list[float]], int]]
 
 
 def _row(items: Sequence[Item], wanted: set[str], order: str, alignment: int) -> Step:
-    """Numbers of fixed size in a row. `layouts[phase]` unpacks the wanted ones of a row that begins at that
-    phase of the alignment."""
+    """Returns the step that reads consecutive numbers of fixed size. `layouts[phase]` unpacks the wanted
+    numbers of a row that begins at this phase of the alignment."""
     layouts = [struct.Struct(order + _row_format(items, wanted, phase, alignment)) for phase in range(8)]
 
     def read(data: bytes, pos: int, values: list[float]) -> int:
@@ -465,7 +473,8 @@ def _row(items: Sequence[Item], wanted: set[str], order: str, alignment: int) ->
 
 
 def _names(item: Item, wanted: set[str]) -> list[str]:
-    """The wanted numbers of an item in the order of the wire. A long array is never written out."""
+    """Returns the paths of an item's wanted numbers in the order in which they are transmitted. The other
+    elements of a long array are not listed."""
     if not item.array:
         return [item.path] if item.path in wanted else []
     return [f"{item.path}[{i}]" for i in _indices(item, wanted)]
@@ -507,8 +516,8 @@ def _text(order: str, alignment: int) -> Step:
 
 
 def _sequence(item: Item, wanted: set[str], order: str, alignment: int) -> Step:
-    """A length and so many elements. Elements that are wanted by index are read (NaN if there are fewer), the
-    others skipped. "[#]" is the length itself."""
+    """Returns the step that reads a length and that many elements. Elements that are wanted by index are read
+    (NaN if there are fewer), the others are skipped. "[#]" is the length itself."""
     unpack, begin = _LENGTH[order].unpack_from, min(4, alignment)
     place = re.compile(re.escape(item.path) + r"\[(\d+)\]")
     indices = sorted({int(match[1]) for name in wanted if (match := place.match(name))})
@@ -549,7 +558,7 @@ def _sequence(item: Item, wanted: set[str], order: str, alignment: int) -> Step:
 
 
 def _at(items: Sequence[Item], i: int) -> list[Item]:
-    """The items of a sequence with their paths at index i."""
+    """Returns the items of a sequence with index i in their paths."""
     return [
         part._replace(path=part.path.replace("[]", f"[{i}]", 1), items=tuple(_at(part.items, i)))
         for part in items
@@ -574,8 +583,8 @@ def _program(items: Sequence[Item], wanted: set[str], order: str, alignment: int
 def ros_decoder(
     items: Sequence[Item], names: Sequence[str], *, version: int
 ) -> Callable[[list[bytes]], np.ndarray]:
-    """A function from n messages to their numbers (n, len(names)). It raises UnreadableMessage for a message
-    that does not fit the layout."""
+    """Returns a function from n messages to their numbers (n, len(names)). The function raises
+    UnreadableMessage if a message does not fit the layout."""
     readable, wanted = _readable(items), set(names)
     exact = len(readable) == len(items)
     has_sequence = any(item.kind == "sequence" for item in readable)
@@ -618,8 +627,8 @@ def _order(steps: list[Step], names: Sequence[str]) -> list[int]:
 
 
 def _ends(data: bytes, size: int, exact: bool, padding: int) -> bool:
-    """Whether a message ends behind its `size` bytes, but for padding. Four bytes and more could be a number
-    of another schema, and must be zeros."""
+    """Returns whether a message ends after its `size` bytes, except for padding. Four or more bytes of
+    padding could be a number of another schema, so they must be zeros."""
     surplus = len(data) - size
     return surplus >= 0 and (
         not exact or surplus <= min(3, padding) or (surplus <= padding and not any(data[size:]))
@@ -629,8 +638,8 @@ def _ends(data: bytes, size: int, exact: bool, padding: int) -> bool:
 def _unpack_alike(
     messages: list[bytes], items: Sequence[Item], wanted: set[str], order: str, alignment: int, padding: int
 ) -> np.ndarray | None:
-    """The numbers (n, k) of messages whose texts are as long as those of the first, by one format for all of
-    them; None if there are others."""
+    """Returns the numbers (n, k) of messages with texts as long as those of the first message, by one format
+    for all; None if a message differs."""
     parts, pos, is_number = [order], 0, []
     try:
         for is_row, run in itertools.groupby(items, key=lambda item: item.kind == "numbers"):
@@ -659,7 +668,8 @@ def _unpack_alike(
 
 
 def _run(data: bytes, steps: list[Step], exact: bool, padding: int) -> list[float]:
-    """The numbers of a message by the steps. Up to `padding` bytes may follow the last step."""
+    """Returns the numbers of a message, read by the steps. Up to `padding` bytes may follow the last step.
+    Raises UnreadableMessage if the message ends elsewhere."""
     values: list[float] = []
     pos = 0
     for _, read in steps:
@@ -687,9 +697,9 @@ Types = dict[str, Descriptor]
 
 
 def message_types(descriptor_set: bytes) -> Types:
-    """{full name of the message: its type} of a serialised FileDescriptorSet.
+    """Returns {full name of the message: its type} of a serialised FileDescriptorSet.
 
-    Raises ValueError for other bytes, and for a set without a file that it imports.
+    Raises ValueError if the bytes are something else, or if the set lacks a file that it imports.
     """
     try:
         files = {file.name: file for file in _FILES.FromString(bytes(descriptor_set)).file}
@@ -724,7 +734,8 @@ def _definition(types: Types, name: str) -> Descriptor:
 
 
 def message_reader(types: Types, name: str) -> Callable[[bytes | memoryview], Message]:
-    """A function from bytes to the message of that name. It raises UnreadableMessage."""
+    """Returns a function from bytes to the message of that name. The function raises UnreadableMessage if the
+    bytes are not such a message."""
     message_class = message_factory.GetMessageClass(_definition(types, name))
 
     def read(data: bytes | memoryview) -> Message:
@@ -745,13 +756,14 @@ def _is_number(field: FieldDescriptor) -> bool:
 
 
 def _is_message(field: FieldDescriptor) -> bool:
-    """Whether a field holds a message. A map holds its entries by key and not by place."""
+    """Returns whether a field holds a message. A map does not count, because its entries are found by key and
+    not by index."""
     return field.message_type is not None and not field.message_type.GetOptions().map_entry
 
 
 def protobuf_fields(types: Types, name: str, sample: bytes | None) -> list[str]:
-    """Paths of the numbers. Of a repeated field they are those of the message `sample`, up to
-    LONGEST_LISTED. Raises ValueError for a type with more than can be listed."""
+    """Returns the paths of the numbers. For a repeated field they are those in the message `sample`, up to
+    LONGEST_LISTED. Raises ValueError if a type has more fields than can be listed."""
     names: list[str] = []
     lists: dict[str, list[str]] = {}
     for visited, (path, field) in enumerate(_leaves(_definition(types, name), "", 0)):
@@ -766,8 +778,8 @@ def protobuf_fields(types: Types, name: str, sample: bytes | None) -> list[str]:
 
 
 def _leaves(message: Descriptor, prefix: str, depth: int) -> Iterator[tuple[str, FieldDescriptor | None]]:
-    """Paths of the numbers, "zones[].celsius" in repeated messages, without what a list holds in lists. A
-    message is a path without a field."""
+    """Yields the paths of the numbers with their fields, such as "zones[].celsius" for repeated messages.
+    Lists inside lists are left out. A message is a path with None as its field."""
     for field in message.fields:
         path = f"{prefix}{field.name}{'[]' if field.is_repeated else ''}"
         if field.is_repeated and "[]" in prefix:
@@ -783,7 +795,8 @@ def _leaves(message: Descriptor, prefix: str, depth: int) -> Iterator[tuple[str,
 
 
 def protobuf_decoder(types: Types, name: str, names: Sequence[str]) -> Callable[[list[bytes]], np.ndarray]:
-    """A function from n messages to their numbers (n, len(names)), NaN for an absent field with presence.
+    """Returns a function from n messages to their numbers (n, len(names)). A field with presence that is
+    absent gives NaN.
 
     "zones[#]" is the length of a list. The function raises UnreadableMessage.
     """
@@ -801,7 +814,7 @@ def protobuf_decoder(types: Types, name: str, names: Sequence[str]) -> Callable[
 
 
 def _is_plain(field: FieldDescriptor | None) -> bool:
-    """Whether a field is a number that every message has."""
+    """Returns whether a field is a number that every message has."""
     return field is not None and _is_number(field) and not field.is_repeated and not field.has_presence
 
 
@@ -810,7 +823,8 @@ FieldStep = tuple[str, bool, int | None]
 
 
 def _steps(message: Descriptor, path: str) -> list[FieldStep]:
-    """The steps from a message to the number of a path. Raises ValueError if there is none."""
+    """Returns the steps from a message to the number of a path. Raises ValueError if the path leads to no
+    number."""
     steps, kind, field = [], message, None
     for part in path.split("."):
         match = re.fullmatch(r"(\w+)(?:\[(\d+|#)\])?", part)
@@ -827,7 +841,7 @@ def _steps(message: Descriptor, path: str) -> list[FieldStep]:
 
 
 def _number(message: Message, steps: Sequence[FieldStep]) -> Any:
-    """The number at the end of the steps, NaN if a message or an element is absent."""
+    """Returns the number at the end of the steps, NaN if a message or an element is absent."""
     part: Any = message
     for name, has_presence, index in steps:
         if has_presence and not part.HasField(name):

@@ -1,9 +1,9 @@
-"""A folder of nozzle frames -> key areas with class, temperature, print and segment for the classifier: CSV
-files with images (the columns of CAXTON: Brion and Pattinson 2022), and MCAP recordings with the setpoints
-that the frames were printed at.
+"""Reads a folder of nozzle frames: key areas with class, temperature, print and segment for the classifier.
+The folder holds CSV files with images (columns of CAXTON: Brion and Pattinson 2022), or MCAP recordings with
+the setpoints at which the frames were printed.
 
-Nothing is dropped: every frame that is listed has its row, and one that cannot be
-learned from has the reason why, counted in the notes.
+No frame is dropped. Every listed frame has its row. If it cannot be used for learning, its row states the
+reason, and the notes count the reasons.
 """
 
 import collections
@@ -82,7 +82,7 @@ OPTIONAL = {
     "print_id": "the file is one print",
     "nozzle_tip_x": "the tip is that of the settings",
     "timestamp": "the order of the rows is not checked",
-    DIRECTION: "the travel direction is that of the ground, if it is seen to move, or of the only line",
+    DIRECTION: "the travel direction is that of the ground, where it is seen to move, or of the only line",
 }
 # beside flow and target temperature, what is constant within a segment where the file has it
 SETTINGS = ("feed_rate", "z_offset")
@@ -109,15 +109,17 @@ DIGEST_BYTES = 16
 
 
 class Topics(NamedTuple):
-    """Where a recording has what we need: the image topic (empty: the only one), the clock (log_time,
-    publish_time or a stamp's field), and the mapping {our signal: (source, unit, scale, offset)}."""
+    """Where a recording holds the data: the image topic (empty: the only one), the clock (log_time,
+    publish_time or the field of a time stamp), and the mapping {our signal: (source, unit, scale,
+    offset)}."""
 
     image: str
     time: str
     mapping: Mapping[str, tuple[str, str, float, float]]
 
     def sources(self) -> dict[str, Source]:
-        """{signal: source}. Raises ValueError for a signal that is none of ours, and for another unit."""
+        """Returns {signal: source}. Raises ValueError if a mapped signal is unknown or its unit is not
+        ours."""
         for name, (_, unit, _, _) in self.mapping.items():
             if name not in UNITS:
                 raise ValueError(
@@ -144,13 +146,16 @@ class ReadOptions(NamedTuple):
 
 
 class NozzleFrames(NamedTuple):
-    """n frames, file by file and in a CSV print by print: images (n, 16, 48) uint8, zeros where not valid;
-    label (n,) 0 under, 1 good, 2 over, -1 unknown; flow (n,) in percent of nominal and temperature (n,) in
-    degC, as of the published material (material.py);
-    print_number (n,) indexes `prints`; segment (n,) counts the stretches of constant settings; valid (n,); n
-    reasons, empty where valid; angle_deg, miss_px, score and padded_share (n,), tip (n, 2) and surroundings
-    (n, measures) of the front end; `source` says where each frame is from, `picture` (n) is its image's path
-    or its recording's with the frame's place in it; notes say what was met."""
+    """n frames, file by file and, in a CSV, print by print.
+
+    `images` (n, 16, 48) uint8, zeros if not valid; `label` (n,): 0 under, 1 good, 2 over, -1 unknown; `flow`
+    (n,): percent of nominal; `temperature` (n,): degC; both converted to the published material
+    (material.py); `print_number` (n,): index into `prints`; `segment` (n,): number of the stretch of constant
+    settings; `valid` (n,); `reasons` (n): empty if valid; `angle_deg`, `miss_px`, `score` and `padded_share`
+    (n,), `tip` (n, 2) and `surroundings` (n, measures): from the front end; `source` (n): where each frame
+    comes from; `picture` (n): path of its image and -1, or path of its recording and the frame's number in
+    it; `notes`: what was found while reading.
+    """
 
     images: np.ndarray
     label: np.ndarray
@@ -174,8 +179,8 @@ class NozzleFrames(NamedTuple):
 
 class FrameLog(NamedTuple):
     """The n rows of one CSV: flow in percent of nominal, temperature in degC, tip (n, 2) in px, direction in
-    degrees, label 0, 1 or 2; NaN, or empty text, where a row has none. `image` is as it was written, with
-    forward slashes; `setting` counts the stretches of constant settings from 0, over all prints."""
+    degrees, label 0, 1 or 2. A missing value is NaN or an empty text. `image` is the path as written, with
+    forward slashes; `setting` numbers the stretches of constant settings from 0, over all prints."""
 
     path: Path
     line: np.ndarray
@@ -191,8 +196,8 @@ class FrameLog(NamedTuple):
 
 
 class FrameFile(NamedTuple):
-    """The n frames of one file with the flow in percent, the temperature in degC and the print of each, NaN
-    and empty if they are not known; reasons that the file itself gives go before those of the front end."""
+    """The n frames of one file with flow in percent, temperature in degC and print of each: NaN and empty if
+    not known. The file's own reasons for leaving out a frame take precedence over those of the front end."""
 
     path: Path
     areas: Any  # what the front end made of them
@@ -206,12 +211,12 @@ class FrameFile(NamedTuple):
 
 
 def read_folder(folder: Path, options: ReadOptions, execution: Execution) -> NozzleFrames:
-    """Every frame that the CSV files and recordings below `folder` list, in the order of their
-    names, cut by as many workers as `execution` says.
+    """Returns every frame that the CSV files and recordings below `folder` list, in the order of the files'
+    names (CSV files first). As many workers as `execution` says crop them.
 
-    Images are looked for beside their CSV and from `folder` on, with the path as written or without its first
-    folders. Raises ValueError, one sentence, for what read_log and read_recording refuse, for two lines that
-    contradict one another about an image, and if no frame at all shows a line.
+    Images are looked for in the folder of their CSV and from `folder` on, with the path as written or without
+    its first folders. Raises ValueError, one sentence, if read_log or read_recording raises one, if two lines
+    about an image contradict each other, and if no frame at all is valid.
     """
     names = _images(folder)
     files = {
@@ -263,7 +268,8 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution) -> Noz
 
 
 def _crops(log: FrameLog, folder: Path, images: list[str], problems: list[str], options: ReadOptions) -> list:
-    """Calls that crop the key areas of a log's images, piece by piece; a line with a reason has no path."""
+    """Returns the calls that crop the key areas of a log's images, piece by piece. A line with a reason has
+    no path."""
     tips = log.tip
     if options.tip_px is not None:
         tips = np.broadcast_to(np.array(options.tip_px, float), log.tip.shape)
@@ -278,8 +284,8 @@ def _crops(log: FrameLog, folder: Path, images: list[str], problems: list[str], 
 
 
 def check(folder: Path, frames: NozzleFrames) -> None:
-    """Raises ValueError if nothing can be learned from the valid frames, or not be
-    judged: one print only, or a class without a frame."""
+    """Raises ValueError if the valid frames are not enough to learn from or to test with: fewer than two
+    prints, or a class without a frame."""
     prints = np.unique(frames.print_number[frames.valid])
     if len(prints) < 2:
         raise ValueError(
@@ -300,7 +306,7 @@ def check(folder: Path, frames: NozzleFrames) -> None:
 
 
 def figures(frames: NozzleFrames) -> dict[str, Any]:
-    """What was read, counted, for the metrics."""
+    """Returns the counts of what was read, for the metrics."""
     reasons = collections.Counter(_kind(reason) for reason in frames.reasons if reason)
     valid = frames.valid
     return {
@@ -314,8 +320,8 @@ def figures(frames: NozzleFrames) -> dict[str, Any]:
 
 
 def pictures(places: Sequence[tuple[Path, int]], topics: Topics) -> list[np.ndarray]:
-    """The gray pictures of (image, -1) or (recording, place among its frames). Raises ValueError if one
-    cannot be read any more."""
+    """Returns the gray pictures. A place is (image, -1), or (recording, number among its frames). Raises
+    ValueError if one can no longer be read."""
     films = {
         path: frames_at(path, topics, [k for recording, k in places if recording == path])
         for path in {path: None for path, k in places if k >= 0}
@@ -327,8 +333,8 @@ def pictures(places: Sequence[tuple[Path, int]], topics: Topics) -> list[np.ndar
 
 
 def _different(paths: Sequence[Path]) -> tuple[list[Path], list[Note]]:
-    """The files without those that are another once more: what is learned from twice is
-    trusted twice, and judged by what it was learned from."""
+    """Returns the files without exact copies of others, and a note on the copies. A copy would count twice in
+    learning, and could be tested with data that was learned from."""
     first: dict[str, Path] = {}
     different = [path for path in paths if first.setdefault(sha256(path), path) == path]
     twice = [path for path in paths if path not in different]
@@ -343,7 +349,8 @@ def _different(paths: Sequence[Path]) -> tuple[list[Path], list[Note]]:
 
 
 def _unread(folder: Path, names: Iterable[str]) -> list[Note]:
-    """A note of files that are no recording, that no CSV names, and that are no text about the others."""
+    """Returns a note on files that are neither recordings, nor named by a CSV, nor texts about the
+    recordings."""
     names = [name for name in names if posixpath.splitext(name)[1].lower() not in TEXTS]
     sentence = (
         f"{folder}: {len(names)} files are named by no CSV and were not read, "
@@ -354,8 +361,8 @@ def _unread(folder: Path, names: Iterable[str]) -> list[Note]:
 
 
 def _images(folder: Path) -> set[str]:
-    """Paths of all files that are not hidden, from `folder` on, with forward
-    slashes; what links lead to once more is walked once."""
+    """Returns the paths of all files that are not hidden, relative to `folder`, with forward slashes. A
+    folder that links lead to again is read once."""
     files, walked = set(), set()
     for place, folders, names in os.walk(folder, followlinks=True):
         # a link may lead back to where it lies
@@ -373,8 +380,8 @@ def _images(folder: Path) -> set[str]:
 
 
 def _image_paths(log: FrameLog, folder: Path, files: set[str]) -> tuple[list[str], list[Note]]:
-    """Each image's path from `folder` on, empty where it is not there: all of a
-    file's lie in one place, that where most are found."""
+    """Returns each image's path relative to `folder`, empty if it is missing, and notes. All images of a CSV
+    are expected in one place: the place in which most of them exist."""
     parts = [[part for part in image.split("/") if part not in ("", ".")] for image in log.image]
     own = log.path.parent.relative_to(folder).as_posix()
 
@@ -417,8 +424,8 @@ def _image_paths(log: FrameLog, folder: Path, files: set[str]) -> tuple[list[str
 
 
 def _line_problems(logs: Sequence[FrameLog], images: Sequence[list[str]]) -> list[list[str]]:
-    """Why a line cannot be learned from, before any image is opened. Raises
-    ValueError if two lines contradict one another."""
+    """Returns for each line the reason why it cannot be used for learning, before any image is opened. Raises
+    ValueError if two lines contradict each other."""
     first: dict[str, tuple[int, int]] = {}
     reasons = []
     for k, (log, paths) in enumerate(zip(logs, images, strict=True)):
@@ -461,7 +468,8 @@ def _check_alike(earlier: FrameLog, i: int, log: FrameLog, j: int) -> None:
 
 
 def _pieces(log: FrameLog) -> Iterator[slice]:
-    """At most TOGETHER lines of one print each: what is added to a folder does not move what was there."""
+    """Yields slices of at most TOGETHER lines of one print each. If files are added to a folder, the slices
+    of the old ones do not change."""
     ends = [i for i in range(1, len(log.print_id)) if log.print_id[i] != log.print_id[i - 1]]
     for start, stop in zip([0, *ends], [*ends, len(log.print_id)], strict=True):
         yield from (slice(k, min(k + TOGETHER, stop)) for k in range(start, stop, TOGETHER))
@@ -471,11 +479,12 @@ def _pieces(log: FrameLog) -> Iterator[slice]:
 
 
 def read_log(path: Path, hotend: float = np.nan) -> FrameLog:
-    """The frames that a CSV lists, those of a print one behind the other. Raises ValueError, one sentence
-    with the line, for a needed column that is not there, text in place of a number, a flow or temperature
-    that no printer has, a label that is no class, and time that runs backwards within a print.
+    """Returns the frames that a CSV lists, print by print. Raises ValueError, one sentence with the line, if
+    a needed column is missing, a number is text, a flow or temperature is impossible for a printer, a label
+    is not a class, or time runs backwards within a print.
 
-    hotend is the temperature of all frames in degC where the file has no column with it; NaN: it must.
+    `hotend`: temperature in degC of all frames if the file has no temperature column. If it is NaN, the file
+    must have one.
     """
     layout = list_layout(path, lambda row: "img_path" in map(_column, row))
     layout = layout._replace(names=[_column(name) for name in layout.names])
@@ -516,22 +525,22 @@ def read_log(path: Path, hotend: float = np.nan) -> FrameLog:
 
 
 def stretches(settings: np.ndarray) -> np.ndarray:
-    """(n,) numbers from 0 of the stretches in which settings (n, k)
-    are constant; NaN is a value of its own."""
+    """Returns the numbers (n,), from 0, of the stretches in which settings (n, k) are constant. NaN counts as
+    a value."""
     settings = np.nan_to_num(settings, nan=np.inf)
     changes = (settings[1:] != settings[:-1]).any(axis=1)
     return np.concatenate([[0], np.cumsum(changes)]).astype(int)
 
 
 def _column(name: str) -> str:
-    """`Img Path` or `IMG-PATH` is img_path; a column that is none of ours keeps its name."""
+    """Returns img_path for `Img Path` or `IMG-PATH`. A column that is not ours keeps its name."""
     plain = re.sub(r"[\s-]+", "_", name.strip()).casefold()
     return plain if plain in COLUMNS else name
 
 
 def _columns(path: Path, layout: CsvLayout, notes: list[Note], hotend: float) -> tuple[str, ...]:
-    """The columns to read, the image first and the temperature second; raises ValueError where one that is
-    needed is not there, and notes those that are lived without."""
+    """Returns the columns to read: the image first, then the temperature if the file has one. Raises
+    ValueError if a needed column is missing. Adds notes on missing optional columns."""
     names = layout.names
     temperature = "target_hotend" if "target_hotend" in names or "hotend" not in names else "hotend"
     stated = bool(np.isfinite(hotend)) and temperature not in names
@@ -563,7 +572,7 @@ def _columns(path: Path, layout: CsvLayout, notes: list[Note], hotend: float) ->
 def _rows(
     path: Path, layout: CsvLayout, names: Sequence[str], notes: list[Note]
 ) -> tuple[dict[str, list[str]], dict[str, np.ndarray], np.ndarray]:
-    """({column: texts}, {column: numbers}, lines), NaN and empty text where nothing is written."""
+    """Returns ({column: texts}, {column: numbers}, lines). An empty field is NaN or an empty text."""
     places = {name: column_place(path, layout.names, name) for name in names}
     texts: dict[str, list[str]] = {
         name: [] for name in ("img_path", "print_id", "timestamp") if name in places
@@ -611,8 +620,8 @@ def _check_numbers(path: Path, lines: np.ndarray, numbers: dict[str, np.ndarray]
 def _check_time(
     path: Path, lines: np.ndarray, stamps: Sequence[str], which: np.ndarray, prints: Sequence[str]
 ) -> None:
-    """Within a print time runs forward or stands still: what follows
-    one another was seen one after the other."""
+    """Raises ValueError if time runs backwards within a print. Equal times are allowed. Rows in sequence must
+    have been recorded in sequence."""
     present = np.array([bool(stamp) for stamp in stamps])
     plain = [stamp for stamp in stamps if stamp]
     try:
@@ -647,12 +656,12 @@ def _check_time(
 def read_recording(
     path: Path, label: Path, where: Topics, tip_px: tuple[float, float] | None, *, front_end: Any
 ) -> FrameFile:
-    """The key areas of a recording, with the setpoints that held when each frame was taken, a few frames in
-    memory at a time; `shown` is the path that is spoken of.
+    """Returns the key areas of a recording, with the setpoints that applied when each frame was taken. Only a
+    few frames are in memory at a time. `label`: the path to use in messages.
 
-    The tip is `tip_px` or, where that is None, the recording's; the print is the recording's print_id, or its
-    file. Raises ValueError, one sentence, if the file cannot be read, has no such topic, or has frames and
-    setpoints that do not overlap in time; what is damaged is left out and noted.
+    The tip is `tip_px` or, if that is None, the recording's. The print is the recording's print_id, or else
+    its file name. Raises ValueError, one sentence, if the file cannot be read, has no such topic, or has
+    frames and setpoints that do not overlap in time. Damaged parts are left out and noted.
     """
     try:
         return _read_recording(path, label, where, tip_px, front_end)
@@ -670,8 +679,8 @@ def read_recording(
 def open_film(
     path: Path, where: Topics
 ) -> tuple[Frames, dict[str, tuple[np.ndarray, np.ndarray]], list[Note]]:
-    """Frames in the order of time, {signal: (time_s (n,), values (n,))} of those that the recording
-    has, on one clock, and notes of what was damaged."""
+    """Returns the frames in the order of time, {signal: (time_s (n,), values (n,))} of the signals that the
+    recording has, on the same clock, and notes on damage."""
     frames, signals, _, notes = read_frames(
         path,
         where.sources().values(),
@@ -687,16 +696,16 @@ def open_film(
 
 
 def frames_at(path: Path, where: Topics, places: Sequence[int]) -> dict[int, np.ndarray]:
-    """{place: gray frame} of a recording's frames that can be decoded, counted from 0 in the order of time;
-    the others are not kept."""
+    """Returns {place: gray frame} of a recording. Places count, from 0 in the order of time, the frames that
+    can be decoded. Other frames are not kept in memory."""
     frames, _, _ = open_film(path, where)
     first = enumerate(itertools.islice(frames, max(places, default=-1) + 1))
     return {k: np.array(frame) for k, (_, frame) in first if k in places}
 
 
 def middle_frame(path: Path, image: str) -> np.ndarray:
-    """The frame (height, width) in the middle of a recording's image topic `image`, or of its
-    only one where that is empty. Raises ValueError."""
+    """Returns the frame (height, width) in the middle of a recording's image topic `image`, or of its only
+    image topic if `image` is empty. Raises ValueError if no picture can be decoded."""
     camera = image_topic(path, open_topics(path, "a film"), image, f"{PLACE}.image")
     frames = Frames(TopicColumns(McapFile(path), "log_time"), camera, 1.0)
     for _, picture in itertools.islice(frames.pictures(), len(frames) // 2, None):
@@ -736,7 +745,7 @@ def _read_recording(
     else:
         sentence = (
             "its temperature changes all the time, so it is measured and ends no segment; "
-            "map the setpoint if there is one"
+            "map the setpoint where there is one"
         )
         notes.append(Note("temperature", "temperature_degC", 1, sentence))
     reasons = areas.reasons
@@ -759,7 +768,7 @@ def _read_recording(
 def _find_all(
     path: Path, frames: Frames, signals: Mapping, tip_px: tuple[float, float] | None, front_end: Any
 ) -> tuple[np.ndarray, Any]:
-    """(time_s (n,), what the front end makes of the frames), of those that can be decoded."""
+    """Returns (time_s (n,), the front end's results), for the frames that can be decoded."""
     times, pieces, walking = [], [], iter(frames)
     while batch := list(itertools.islice(walking, AT_ONCE)):
         time_s = np.array([time for time, _ in batch])
@@ -782,8 +791,8 @@ def _find_all(
 
 
 def _hold(signals: Mapping[str, tuple[np.ndarray, np.ndarray]], name: str, time_s: np.ndarray) -> np.ndarray:
-    """The signal's value at each time (n,): a setpoint holds until the next; NaN
-    before the first, and where there is no such signal."""
+    """Returns the signal's value at each time (n,). A setpoint holds until the next one. NaN before the first
+    one, and if there is no such signal."""
     if name not in signals:
         return np.full(len(time_s), np.nan)
     at, values = signals[name]
@@ -829,8 +838,8 @@ def _of_log(
 
 
 def _join(folder: Path, parts: Sequence[FrameFile], options: ReadOptions, notes: list[Note]) -> NozzleFrames:
-    """All parts, copies of frames left out, every rejection counted by file and reason; flows and
-    temperatures carried to the published material."""
+    """Returns all parts as one, without copies of frames. Counts every rejection by file and reason. Flows
+    and temperatures are converted to the published material."""
     digests: set[str] = set()
     notes, reasons, starts = list(notes), [], [0]
     for part in parts:
@@ -886,7 +895,7 @@ def _join(folder: Path, parts: Sequence[FrameFile], options: ReadOptions, notes:
 def _rejections(
     folder: Path, part: FrameFile, reasons: Sequence[str], remedies: Mapping[str, str]
 ) -> list[Note]:
-    """One note for each kind of reason, with the first frame and what to do."""
+    """Returns one note for each kind of reason, with the first frame and the remedy."""
     by_kind: dict[str, list[int]] = {}
     for i, reason in enumerate(reasons):
         if reason:
@@ -912,9 +921,9 @@ def _kind(reason: str) -> str:
 def key_areas_of_files(
     paths: Sequence[str], tips: np.ndarray, directions_deg: np.ndarray, front_end: Any
 ) -> Any:
-    """What a front end makes of image files with tips (n, 2) in px and travel directions (n,) in degrees, NaN
-    if they are not known; one file's pixels in memory at a time. An empty path is a frame that is not looked
-    at."""
+    """Returns the front end's results for image files with tips (n, 2) in px and travel directions (n,) in
+    degrees, NaN if not known. Only one file's pixels are in memory at a time. An empty path is a frame that
+    is skipped."""
     digests = [_digest(path) for path in paths]
 
     def find() -> Any:
@@ -926,7 +935,7 @@ def key_areas_of_files(
 
 
 def concatenate(parts: Sequence[Any]) -> Any:
-    """The frames of all parts, each a tuple of columns, one part behind the other."""
+    """Returns the frames of all parts, one part after the other. Each part is a tuple of columns."""
     columns = zip(*parts, strict=True)
     return type(parts[0])(
         *(
@@ -939,7 +948,7 @@ def concatenate(parts: Sequence[Any]) -> Any:
 
 
 def _digest(path: str) -> str:
-    """Of the file's bytes; empty where it cannot be opened."""
+    """Returns the digest of the file's bytes, empty if it cannot be opened."""
     try:
         return sha256(path)[: 2 * DIGEST_BYTES] if path else ""
     except OSError:

@@ -1,4 +1,4 @@
-"""A mapping and a plant proposed from the names, units and ranges of a recording's signals."""
+"""Proposes a mapping and a plant from the names, units and ranges of a recording's signals."""
 
 import json
 import math
@@ -74,8 +74,8 @@ RESTING_SHARE, MORE_LEVELS = 0.95, 4
 
 
 class RecordedSignal(NamedTuple):
-    """A column: its source, the unit that the file gives, its finite numbers, the limits that the file gives,
-    and its role in the proposal."""
+    """A column: its source, the unit and the limits that the file gives, its finite numbers, and its role in
+    the proposal."""
 
     source: str
     unit: str
@@ -89,10 +89,10 @@ class RecordedSignal(NamedTuple):
 
 
 class Proposed(NamedTuple):
-    """A signal of the plant, "input", "disturbance" or "output", with its source and conversion. A limit or a
-    reference that nothing tells is None. `heats`: its name says that it can only warm. `set_point` is the
-    column of what an output should be, "" for none. `cut_off`: the firmware switches off at this temperature
-    in °C, None if the file does not say it."""
+    """A signal of the plant with its source and conversion. `role`: "input", "disturbance" or "output". A
+    limit or a reference is None if the recording does not give it. `heats`: its name says that it can only
+    heat. `set_point`: the column of an output's set-point, "" for none. `cut_off`: temperature in °C at which
+    the firmware switches off, None if the file does not give it."""
 
     name: str
     role: str
@@ -109,8 +109,9 @@ class Proposed(NamedTuple):
 
 
 class Proposal(NamedTuple):
-    """What `ingest.mapping` and `plant` could be; `how` says what it was guessed from, `time` is ingest.time,
-    `sample_time_s` the record's own clock. `set_points` belong to no output; nothing heats `unheated`."""
+    """A proposal for `ingest.mapping` and `plant`. `how`: what it was guessed from; `time`: ingest.time;
+    `sample_time_s`: from the recording's clock; `set_points`: those of no output; `unheated`: temperatures
+    that nothing heats."""
 
     signals: list[Proposed]
     how: str
@@ -123,7 +124,7 @@ class Proposal(NamedTuple):
 def propose(
     signals: Sequence[RecordedSignal], groups: Sequence[tuple[FileColumns, str]], time: str
 ) -> Proposal:
-    """The proposal for the signals of a recording, which have the clocks of `groups`."""
+    """Returns the proposal for the signals of a recording, which have the clocks of `groups`."""
     signals, how = _with_roles(signals)
     targets = _targets(signals)
     used = {target.source for target in targets.values()}
@@ -141,7 +142,7 @@ def propose(
 
 
 def yaml_lines(proposal: Proposal) -> list[str]:
-    """The proposal as YAML to paste under `ingest` and `plant`."""
+    """Returns the proposal as lines of YAML to paste under `ingest` and `plant`."""
     if not proposal.signals:
         return ["# no column looks like an input or an output of the machine; write the mapping by hand"]
     inputs, disturbances, outputs = plant_lines(proposal)
@@ -177,7 +178,7 @@ def yaml_lines(proposal: Proposal) -> list[str]:
 
 
 def mapping_lines(proposal: Proposal) -> list[str]:
-    """`ingest.mapping`, a line a signal."""
+    """Returns the lines of `ingest.mapping`, one line per signal."""
     return [
         f"{s.name}: {{source: {_yaml(s.source)}, "
         + (f"set_point: {_yaml(s.set_point)}, " if s.set_point else "")
@@ -187,7 +188,7 @@ def mapping_lines(proposal: Proposal) -> list[str]:
 
 
 def plant_lines(proposal: Proposal) -> tuple[list[str], list[str], list[str]]:
-    """`plant.inputs`, `plant.disturbances` and `plant.outputs`, a line a signal."""
+    """Returns the lines of `plant.inputs`, `plant.disturbances` and `plant.outputs`, one line per signal."""
     inputs = [
         f"{{name: {s.name}, unit: {s.unit}, low: {_number(s.low)}, high: {_number(s.high)}"
         + (", heats: true}" if s.heats else "}")
@@ -214,8 +215,9 @@ def _number(value: float | None) -> str:
 
 
 def telling_name(source: str) -> str:
-    """What names a signal: its field, or its topic's last part if the field says nothing ("data"). An index
-    of a topic's field counts from 1: "/zone_temperature:data[0]" is zone_temperature_1."""
+    """Returns the words that name a signal: its field or, if the field says nothing ("data"), its topic's
+    last part. The index of a topic's field counts from 1: "/zone_temperature:data[0]" is
+    zone_temperature_1."""
     topic, _, field = source.rpartition(":")
     name, index = field.strip(), None
     if topic.startswith("/") and (index := re.search(r"\[(\d+)\]$", name)):
@@ -227,8 +229,8 @@ def telling_name(source: str) -> str:
 
 
 def telling(sources: Sequence[str], limit: int) -> list[str]:
-    """At most `limit` of the sources, in their order: first those whose names tell a heater, a motor, a
-    temperature or a set-point."""
+    """Returns at most `limit` of the sources, in their order. Sources with names that suggest a heater, a
+    motor, a temperature or a set-point are taken first."""
     if len(sources) <= limit:
         return list(sources)
     tells = [_is_telling(source) for source in sources]
@@ -243,17 +245,17 @@ def _is_telling(source: str) -> bool:
 
 
 def has_bare_field(fields: Sequence[str]) -> bool:
-    """Whether one of a topic's fields says nothing without the topic."""
+    """Returns whether one of a topic's fields says nothing without the topic's name."""
     return any(field.casefold() in _BARE_FIELDS for field in fields)
 
 
 def sample(values: np.ndarray) -> np.ndarray:
-    """At most LOOKED_AT of the values, from one end to the other."""
+    """Returns every k-th of the values, with k so large that fewer than twice LOOKED_AT remain."""
     return values[:: max(1, len(values) // LOOKED_AT)]
 
 
 def _is_switch(signal: RecordedSignal) -> bool:
-    """Whether a signal has the values 0 and 1 alone."""
+    """Returns whether a signal has only the values 0 and 1."""
     few = sample(signal.values)
     return bool(((few == 0) | (few == 1)).all()) and bool(np.isin(signal.values, (0.0, 1.0)).all())
 
@@ -264,7 +266,7 @@ def _is_constant(signal: RecordedSignal) -> bool:
 
 
 def _with_roles(signals: Sequence[RecordedSignal]) -> tuple[list[RecordedSignal], str]:
-    """The signals with their roles, and what these were guessed from."""
+    """Returns the signals with their roles, and what the roles were guessed from."""
     named = _with_commands_y([signal._replace(role=_role(signal)) for signal in signals])
     named = _without_hidden_set_points(named)
     roles = {signal.role for signal in named}
@@ -284,8 +286,8 @@ def _with_roles(signals: Sequence[RecordedSignal]) -> tuple[list[RecordedSignal]
 
 
 def _with_commands_y(signals: Sequence[RecordedSignal]) -> Sequence[RecordedSignal]:
-    """The signals with Y1, Y2 as what a controller gives (DIN 19226), if there is a set-point and nothing
-    else is given; else y is a measured output."""
+    """Returns the signals with Y1, Y2 as inputs, the controller's commands (DIN 19226), if there is a
+    set-point and no other input. Otherwise y is a measured output."""
     roles = {signal.role for signal in signals}
     outputs = [signal for signal in signals if signal.role == "output"]
     commands = [
@@ -301,9 +303,10 @@ def _with_commands_y(signals: Sequence[RecordedSignal]) -> Sequence[RecordedSign
 
 
 def _without_unheated(signals: Sequence[RecordedSignal]) -> list[RecordedSignal]:
-    """The signals without temperatures that nothing heats: those of devices without a duty, if other devices
-    of the recording have one, are the board's own sensors; a chamber's without a heater is the air around the
-    machine. Names are "device.temp" and "device.pwm"."""
+    """Returns the signals with new roles for temperatures that nothing heats. If some devices of the
+    recording have a duty, the temperatures of devices without one are sensors of the board ("beside"). A
+    chamber without a heater is the air around the machine ("disturbance"). Names are "device.temp" and
+    "device.pwm"."""
     heated = {s.source.rpartition(".")[0] for s in signals if s.source.endswith(".pwm")}
     chamber = {s.source for s in signals if "chamber" in split(s.source).split()}
     inputs = {s.source for s in signals if s.role == "input"}
@@ -318,9 +321,9 @@ def _without_unheated(signals: Sequence[RecordedSignal]) -> list[RecordedSignal]
 
 
 def _without_strangers(signals: Sequence[RecordedSignal]) -> Sequence[RecordedSignal]:
-    """The signals without inputs of devices that no temperature belongs to, which are disturbances: the
-    command of a drive among those of zones. An input belongs to an output of the same numbers or with one of
-    its words, or its name says that it heats."""
+    """Returns the signals; inputs that belong to no temperature become disturbances, for example the command
+    of a drive among the commands of zones. An input belongs to an output with the same numbers or with one of
+    its words. It also belongs if its name means a heater, a cooler or a place."""
     outputs = [(_numbers(s.source), _plain_words(s.source)) for s in signals if s.role == "output"]
     inputs = [s for s in signals if s.role == "input"]
     shared = set.intersection(*(_plain_words(s.source) for s in inputs)) if inputs else set()
@@ -343,8 +346,9 @@ def _is_warm(signal: RecordedSignal) -> bool:
 
 
 def _role(signal: RecordedSignal) -> str:
-    """ "set-point", "input", "electric" (an input if there is no other), "disturbance", "output", "beside" (a
-    temperature that nothing heats) or "", by the words of the name, its unit and the range of its values."""
+    """Returns the role, from the words of the name, its unit and the range of its values: "set-point",
+    "input", "electric" (an input if there is no other), "disturbance", "output", "beside" (a temperature that
+    nothing heats) or ""."""
     text = telling_name(signal.source)
     if not len(signal.values) or _SILENT.search(text.casefold()):
         return ""
@@ -358,7 +362,7 @@ def _role(signal: RecordedSignal) -> str:
 
 
 def _role_of_name(name: Name, signal: RecordedSignal) -> str:
-    """The role by the first rule that holds."""
+    """Returns the role that the first matching rule gives."""
     words, kind, values = name.words, name.kind, signal.values
     low, high, is_constant = values.min(), values.max(), _is_constant(signal)
     says_heater, says_place = says(HEATER, words), says(PLACE, words)
@@ -397,8 +401,8 @@ def _role_of_name(name: Name, signal: RecordedSignal) -> str:
 
 
 def _is_set_point(words: str, warm: bool) -> bool:
-    """Whether the words mean a set-point: by a word of its own, as the command of a temperature, as w beside
-    x and y (DIN 19226), or as a tool's active and standby temperature (RepRapFirmware)."""
+    """Returns whether the words mean a set-point: a word for it, the command of a temperature, w beside x and
+    y (DIN 19226), or a tool's active or standby temperature (RepRapFirmware)."""
     heated = warm or says(HEATER, words) or says(PLACE, words)
     return (
         says(SET_POINT, words)
@@ -409,8 +413,9 @@ def _is_set_point(words: str, warm: bool) -> bool:
 
 
 def _behaviour(signal: RecordedSignal) -> str:
-    """The role by the values alone. Commands rest and jump between few levels, or stay near two of them;
-    measurements do neither. A counter has no role, nor has a table of a few rows."""
+    """Returns the role from the values alone. Commands are often constant and jump between few levels, or
+    stay near two levels; measurements do neither. A counter has no role, and neither does a table of a few
+    rows."""
     finite = signal.values
     if (
         _SILENT.search(telling_name(signal.source).casefold())
@@ -426,8 +431,8 @@ def _behaviour(signal: RecordedSignal) -> str:
 
 
 def _bimodality(values: np.ndarray) -> float:
-    """(skewness^2 + 1) / kurtosis: 1 for two levels, 5/9 for a uniform distribution, 1/3 for a normal one
-    (Pearson)."""
+    """Returns (skewness^2 + 1) / kurtosis: 1 for two levels, 5/9 for a uniform distribution, 1/3 for a normal
+    one (Pearson)."""
     values = values / np.abs(values).max()
     spread = values.std()
     if not spread > 0:
@@ -444,8 +449,8 @@ def _rests(values: np.ndarray) -> bool:
 
 
 def _without_hidden_set_points(signals: Sequence[RecordedSignal]) -> list[RecordedSignal]:
-    """An output that rests at few levels beside a measured one of the same numbers, around the same
-    temperature, is the set-point of that one, whatever it is called."""
+    """Returns the signals with hidden set-points marked. An output that stays at few levels is the set-point
+    of a measured output with the same numbers, around the same temperature, whatever its name is."""
     outputs = [(s, _numbers(s.source), np.unique(sample(s.values))) for s in signals if s.role == "output"]
     moving = [entry for entry in outputs if not _rests(entry[0].values)]
     hidden = {
@@ -465,7 +470,7 @@ def _numbers(source: str) -> tuple[str, ...]:
 
 
 def _plain_words(source: str) -> set[str]:
-    """The words of a name that tell neither a temperature nor its set-point, with the numbers."""
+    """Returns the words of a name, and its numbers, without the words for a temperature or its set-point."""
     words = read_name(source).words
     for pattern in (SET_POINT, ACTUAL, TEMPERATURE):
         words = pattern.sub(" ", words)
@@ -473,8 +478,8 @@ def _plain_words(source: str) -> set[str]:
 
 
 def _targets(signals: Sequence[RecordedSignal]) -> dict[str, RecordedSignal]:
-    """{output: its set-point}: of the same numbers, with the most words in common. If no output has the same
-    numbers, words and numbers count alike."""
+    """Returns {output: its set-point}. The set-point has the output's numbers and the most words in common
+    with it. If no output has the same numbers, words and numbers count equally."""
     outputs = {s.source: (_numbers(s.source), _plain_words(s.source)) for s in signals if s.role == "output"}
     targets: dict[str, tuple[float, RecordedSignal]] = {}
     for signal in signals:
@@ -523,14 +528,16 @@ def _propose_signal(
 
 
 def _input_limits(percent: np.ndarray, *, guessed: bool) -> tuple[float, float]:
-    """0 to 100 percent, or from below zero where it was recorded there. Of a `guessed` input nothing says
-    that it is percent: the whole numbers around what was recorded, so that no experiment asks for more."""
+    """Returns the limits: 0 to 100 percent, or from below zero if negative values were recorded. For a
+    `guessed` input nothing says that it is in percent. Its limits are the whole numbers around the recorded
+    values, so that no experiment goes beyond them."""
     low, high = max(-100.0, float(np.floor(percent.min()))), min(100.0, float(np.ceil(percent.max())))
     return (low, high) if guessed else (min(0.0, low), 100.0)
 
 
 def _reference(celsius: np.ndarray, target: RecordedSignal | None, scale: float, offset: float) -> float:
-    """The set-point that was held longest, or the median where there is none."""
+    """Returns the set-point that was held longest, or the median of the temperature if there is no
+    set-point."""
     wanted = target.values if target is not None else np.empty(0)
     levels, counts = np.unique(wanted[wanted > 0], return_counts=True)
     if len(levels):
@@ -539,21 +546,23 @@ def _reference(celsius: np.ndarray, target: RecordedSignal | None, scale: float,
 
 
 def _words_of(signal: RecordedSignal) -> list[str]:
-    """The words of the topic's last part and of the telling name, each once."""
+    """Returns the words of the topic's last part and of the telling name; the topic's are left out if that
+    name begins with them."""
     topic, words = signal.source.rpartition(":")[0].rpartition("/")[2], signal.name.words.split()
     return words if telling_name(signal.source).startswith(topic) else [*split(topic).split(), *words]
 
 
 def _common_words(signals: Sequence[RecordedSignal], role: str) -> int:
-    """How many first words the names of all signals of a role share."""
+    """Returns how many of the first words are the same in the names of all signals of a role."""
     names = [_words_of(signal) for signal in signals if signal.role == role]
     shared = [len(set(column)) == 1 for column in zip(*names, strict=False)]
     return shared.index(False) if len(names) > 1 and False in shared else 0
 
 
 def _name(signal: RecordedSignal, prefix: int, names: set[str]) -> str:
-    """heater_1, temperature_bed, ...; an array of a topic, a motor and a disturbance keep their own names in
-    letters, digits and _. The number is the first one behind the words that all signals of the role share."""
+    """Returns a new name: heater_1, temperature_bed, ... An array of a topic, a motor and a disturbance keep
+    their own names, in letters, digits and _. The number is the first one after the words that all signals of
+    the role share."""
     words = _words_of(signal)
     number = next((word for word in [*words[prefix:], *words] if word.isdigit()), "")
     text = " ".join(words)
@@ -577,14 +586,14 @@ def _name(signal: RecordedSignal, prefix: int, names: set[str]) -> str:
 
 
 def _is_common(word: str) -> bool:
-    """Whether a word tells the role alone, and nothing of the place."""
+    """Returns whether a word says only what the role is, and nothing about the place."""
     return word in _COMMON_WORDS or any(
         says(pattern, word) for pattern in (SET_POINT, ACTUAL, DUTY, OUTPUT, COMMAND)
     )
 
 
 def _conversion(signal: RecordedSignal) -> tuple[str, float, float]:
-    """The unit of ours, and the scale and offset that lead to it."""
+    """Returns our unit, and the scale and offset that convert to it."""
     name, finite = signal.name, signal.values
     low, high = finite.min(), finite.max()
     if signal.role == "disturbance" and not _is_warm(signal):
@@ -605,13 +614,14 @@ def _conversion(signal: RecordedSignal) -> tuple[str, float, float]:
 
 
 def _to_percent(full: float) -> float:
-    """100 / full to six digits, rounded down: the largest recorded value stays within 100 %."""
+    """Returns 100 / full to six digits, rounded down, so that the largest recorded value stays within 100
+    %."""
     unit = 10.0 ** (math.floor(math.log10(100 / full)) - 5)
     return float(f"{math.floor(100 / full / unit) * unit:.6g}")
 
 
 def _yaml(source: str) -> str:
-    """A YAML scalar, quoted if it could be taken for anything else."""
+    """Returns a YAML scalar, quoted if YAML could read it as something else."""
     return (
         source
         if re.fullmatch(r"[A-Za-z_]\w*|/[\w/.:]*\w", source) and ": " not in source
@@ -620,7 +630,7 @@ def _yaml(source: str) -> str:
 
 
 def _sample_time(groups: Sequence[tuple[FileColumns, str]]) -> float:
-    """The largest of the clocks' median intervals, to two digits."""
+    """Returns the largest of the clocks' median intervals, to two digits."""
     medians = []
     for group, _ in groups:
         if len(group.time) > 1:

@@ -1,6 +1,5 @@
-"""Flags for doubtful samples of a table, with place and count: spikes, frozen sensors, rails, constants,
-quantisation, units. Wrong samples are masked.
-"""
+"""Flags doubtful samples of a table, with place and count: spikes, frozen sensors, saturated sensors,
+constants, quantisation, units. Wrong samples are masked."""
 
 import itertools
 from collections.abc import Collection, Mapping
@@ -35,12 +34,13 @@ def flag(
     limits: Mapping[str, tuple[float, float]],
     computed: Collection[str] = (),
 ) -> Table:
-    """The table with flags for doubtful samples. Samples that are no measurement are masked; values stay.
+    """Returns the table with flags for doubtful samples. Samples that are no measurement are masked. Values
+    are not changed.
 
-    `limits` are {input: (low, high)} in the input's unit; all other signals are outputs, but those that were
-    `computed` from a printed file, which no sensor measured. Spikes and frozen stretches are masked. These
-    are only reported: quantised, saturated, outside (an input beyond its limits), constant, unit (looks like
-    kelvin, fahrenheit, a duty of 0-1).
+    `limits`: {input: (low, high)} in the input's unit. All other signals are outputs, except those `computed`
+    from a printed file, which no sensor measured. Spikes and frozen stretches are masked. These are only
+    reported: quantised, saturated, outside (an input beyond its limits), constant, unit (looks like kelvin,
+    fahrenheit, a duty of 0-1).
     """
     outputs = [name for name in table.values if name not in limits and name not in computed]
     flags, masked = list(table.flags), {name: mask.copy() for name, mask in table.masked.items()}
@@ -60,13 +60,13 @@ def flag(
 
 
 def values_or_nan(table: Table, name: str) -> np.ndarray:
-    """The values (T,) of a signal, NaN where it is masked; no copy where nothing is."""
+    """Returns the values (T,) of a signal, NaN where it is masked. They are not copied if none is masked."""
     masked = table.masked[name]
     return np.where(masked, np.nan, table.values[name]) if masked.any() else table.values[name]
 
 
 def _usable(table: Table, name: str) -> np.ndarray:
-    """The values that are not masked; no copy if none is."""
+    """Returns the values that are not masked. They are not copied if none is masked."""
     masked = table.masked[name]
     return table.values[name][~masked] if masked.any() else table.values[name]
 
@@ -78,15 +78,15 @@ def _flag(table: Table, name: str, kind: str, where: np.ndarray, message: str) -
 
 
 def _groups(where: np.ndarray, segment: np.ndarray) -> list[np.ndarray]:
-    """Sorted indices, split at every index that is missing and at the ends of segments."""
+    """Returns the sorted indices as groups, split at every missing index and at the ends of segments."""
     if not len(where):
         return []
     return np.split(where, np.flatnonzero((np.diff(where) > 1) | (np.diff(segment[where]) != 0)) + 1)
 
 
 def _residual(table: Table, name: str) -> np.ndarray:
-    """What each value differs by from the local median in its segment. The last value before a masked gap
-    bridges the gap."""
+    """Returns the difference of each value from the local median in its segment. Inside a masked gap the last
+    value before it is used."""
     residual = np.zeros(len(table.time_s))
     values = values_or_nan(table, name)
     starts = [0, *(np.flatnonzero(np.diff(table.segment)) + 1).tolist(), len(values)]
@@ -104,7 +104,7 @@ def _residual(table: Table, name: str) -> np.ndarray:
 
 
 def _spikes(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
-    """Isolated samples that leave the local median and come back (Hampel 1974,
+    """Returns flags and indices of isolated samples that leave the local median and come back (Hampel 1974,
     with guards for quantised and for smooth signals)."""
     residual, usable = _residual(table, name), ~table.masked[name]
     size = np.abs(residual)
@@ -133,14 +133,15 @@ def _spikes(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
 
 
 def _none_stands_out(size: np.ndarray) -> bool:
-    """Whether no residual can be beyond eight of the deviations that the 90th percentile tells: more than a
-    tenth are at least an eighth as large as such a one. That is found by counting, in place of sorting."""
+    """Returns whether no residual can exceed eight deviations, with the deviation estimated from the 90th
+    percentile. This holds if more than a tenth of the residuals are at least about a fifth of the largest
+    one. Counting them is faster than sorting."""
     limit = size.max() / SPIKE_SIGMAS * 1.645 * (1 + 1e-9)  # beyond what rounding does to the percentile
     return bool(np.count_nonzero(size >= limit) >= len(size) - int(0.9 * (len(size) - 1)))
 
 
 def _stands_alone(table: Table, name: str, group: np.ndarray, size: float) -> bool:
-    """Whether the neighbours on both sides go on as if the group were not there."""
+    """Returns whether the neighbours on both sides continue as if the group were not there."""
     inside = np.flatnonzero(table.segment == table.segment[group[0]])
     window = inside[(inside >= group[0] - SPIKE_WINDOW) & (inside <= group[-1] + SPIKE_WINDOW)]
     neighbours = window[~np.isin(window, group) & ~table.masked[name][window]]
@@ -151,11 +152,11 @@ def _stands_alone(table: Table, name: str, group: np.ndarray, size: float) -> bo
 
 
 def quantisation_step(values: np.ndarray) -> float:
-    """The step of a quantised signal, 0 if the levels have no common step.
+    """Returns the step of a quantised signal, 0 if the levels have no common step.
 
-    The median distance d of neighbouring levels is the step if nine tenths of the distances are whole
-    multiples of it (to a tenth: rounded print-outs of 0.0322 differ by 0.032 or 0.033) and if values come
-    back to their levels, at least three times each.
+    The median distance d of neighbouring levels is the step under two conditions. Nine tenths of the
+    distances are whole multiples of d (to a tenth: rounded print-outs of 0.0322 differ by 0.032 or 0.033).
+    And values come back to their levels, at least three times each on average.
     """
     # a signal with all its digits shows in little more than a third of its values that it has too many levels
     some = values[: 2 * len(values) // 5] if len(values) >= MANY_VALUES else values
@@ -182,9 +183,9 @@ STILL_DEVIATIONS, STILL_STEPS = 6.0, 3.0  # of the noise from sample to sample, 
 
 
 def stands_still(measured: np.ndarray, set_point: np.ndarray | None) -> bool:
-    """Whether a temperature (T,) in °C never moves: 99 % of its samples lie within STILL_DEGC, and its
-    set-point (T,) never changed. If that was not recorded (None), they span no more than noise
-    or a few steps of the sensor."""
+    """Returns whether a temperature (T,) in °C never moves: 99 % of its samples lie within STILL_DEGC, and
+    its set-point (T,) never changed. If the set-point was not recorded (None), the samples must span no more
+    than noise or a few steps of the sensor."""
     if len(measured) < 2:
         return False
     low, high = np.quantile(measured, [0.005, 0.995])
@@ -269,8 +270,8 @@ def _unit_flags(
 
 
 def _at_rest(table: Table, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]) -> bool:
-    """Whether the recording begins on a machine at the room's temperature: every input is at 0 or its lowest,
-    or several temperatures are alike."""
+    """Returns whether the recording begins with the machine at the room's temperature: every input is at 0 or
+    at its lowest value, or several temperatures are alike."""
     first = {name: float(_usable(table, name)[0]) for name in table.values if len(_usable(table, name))}
     idle = bool(limits) and all(first.get(name, np.nan) in (0.0, low) for name, (low, _) in limits.items())
     starts = [
@@ -282,8 +283,8 @@ def _at_rest(table: Table, units: Mapping[str, str], limits: Mapping[str, tuple[
 
 
 def _celsius_doubts(values: np.ndarray, resting: bool) -> list[tuple[object, str]]:
-    """(whether it holds, words) of the units that the values may be in instead of °C; the first that holds
-    counts."""
+    """Returns (whether it holds, words) for the units that the values may have instead of °C. The first that
+    holds counts."""
     first, median, low, high = values[0], float(np.median(values)), values.min(), values.max()
     return [
         (
@@ -309,7 +310,7 @@ def _celsius_doubts(values: np.ndarray, resting: bool) -> list[tuple[object, str
 
 
 def _percent_doubts(values: np.ndarray, limit: float) -> list[tuple[object, str]]:
-    """(whether it holds, words) of what the values may be instead of percent."""
+    """Returns (whether it holds, words) for what the values may be instead of percent."""
     low, high = values.min(), values.max()
     converted = low >= 0.0 and max(100.0, limit) < high and bool((values == np.rint(values)).all())
     duty = f"lies within {low:g} to {high:g}: it looks like a duty of 0 to 1; set scale: 100 if it is"
@@ -333,10 +334,11 @@ BESIDE = 24
 
 
 def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
-    """Stretches of one value that are far longer than usual for the signal and begin at once.
+    """Returns flags and indices of stretches of one value that begin at once and are far longer than usual
+    for the signal.
 
-    Noise ends at once at an end of the stretch, or a movement does although it went on: a jump at the end of
-    the stretch shows that, or other signals that move meanwhile.
+    Either noise stops at once at an end of the stretch, or a movement stops although the process continued.
+    This shows as a jump at the end of the stretch, or as other signals that move during it.
     """
     values = values_or_nan(table, name)
     if not _may_rest(values, FROZEN_SHORTEST):
@@ -371,7 +373,7 @@ def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
 
 
 def rails(table: Table, name: str) -> list[Flag]:
-    """Flags for a largest or smallest value at which the signal stops at once and stays for long."""
+    """Returns flags for a largest or smallest value at which the signal stops at once and stays for long."""
     values = values_or_nan(table, name)
     if not _may_rest(values, RAIL_SHORTEST + 1):
         return []
@@ -398,13 +400,14 @@ def rails(table: Table, name: str) -> list[Flag]:
 
 
 def _may_rest(values: np.ndarray, least: int) -> bool:
-    """Whether enough samples equal the one before for a stretch of `least`: a quick no for a fine signal."""
+    """Returns whether enough samples equal the previous one for a stretch of `least`. This is a quick test
+    that excludes finely resolved signals."""
     return bool(np.count_nonzero(values[1:] == values[:-1]) >= least - 1)
 
 
 def runs(values: np.ndarray, segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First and last index (m,) of stretches of equal values within segments. A NaN ends a stretch and is in
-    none."""
+    """Returns the first and last index (m,) of stretches of equal values within segments. A NaN ends a
+    stretch and belongs to none."""
     begins = np.ones(len(values), bool)
     begins[1:] = (values[1:] != values[:-1]) | (segment[1:] != segment[:-1])
     first = np.flatnonzero(begins)
@@ -414,8 +417,9 @@ def runs(values: np.ndarray, segment: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _usual_of_others(lengths: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """For stretches of length `own` (k,) among `lengths` (m,): the length that holds nine tenths of the
-    samples of the m - 1 others, infinite without others. A coarse or slow signal rests long, if not often."""
+    """Returns, for stretches of length `own` (k,) among `lengths` (m,), the usual length of the m - 1 others:
+    stretches up to this length hold nine tenths of the others' samples. It is infinite without others. A
+    coarse or slow signal has few, but long, stretches."""
     if len(lengths) < 2:
         return np.full(len(own), np.inf)
     ordered = np.sort(lengths)
@@ -429,28 +433,29 @@ def _usual_of_others(lengths: np.ndarray, own: np.ndarray) -> np.ndarray:
 
 
 def _before(values: np.ndarray, segment: np.ndarray, first: int) -> np.ndarray:
-    """Changes from sample to sample that lead to `first`, within its segment."""
+    """Returns the changes from sample to sample that lead to `first`, within its segment."""
     start = max(first - BESIDE, int(np.searchsorted(segment, segment[first])))
     return np.diff(values[start : first + 1])
 
 
 def _after(values: np.ndarray, segment: np.ndarray, last: int) -> np.ndarray:
-    """Changes from `last` on, within its segment."""
+    """Returns the changes from `last` on, within its segment."""
     end = min(last + BESIDE, int(np.searchsorted(segment, segment[last], side="right")) - 1)
     return np.diff(values[last : end + 1])
 
 
 def least_change(values: np.ndarray, lag: int = 1) -> float:
-    """The first percentile of the changes over `lag` samples, infinite without changes: one step of a coarse
-    sensor, next to nothing of a fine one."""
+    """Returns the first percentile of the nonzero changes over `lag` samples, infinite without changes. For a
+    coarse sensor this is one step, for a fine one it is close to 0."""
     changes = np.abs(values[lag:] - values[:-lag])
     changes = changes[changes > 0]
     return float(np.percentile(changes, 1)) if len(changes) else np.inf
 
 
 def _alive(changes: np.ndarray, step: float) -> str:
-    """The signal before it stops: "noise" of more than its step, "movement" one way that does not slow down,
-    "" for neither (it rests, or comes to rest), "edge" if the record has too little of it."""
+    """Returns what the signal did before it stopped: "noise" larger than its step, "movement" in one
+    direction that does not slow down, "" for neither (it rests, or comes to rest), "edge" if the record has
+    too few samples there."""
     changes = changes[np.isfinite(changes)]
     if len(changes) < BESIDE // 2:
         return "edge"
@@ -472,14 +477,14 @@ def _range(values: np.ndarray) -> float:
 
 
 def _moves(inside: np.ndarray, full_range: float) -> bool:
-    """Whether a signal changes over a stretch by a tenth of its own range."""
+    """Returns whether a signal changes over a stretch by at least a tenth of its own range."""
     inside = inside[np.isfinite(inside)]
     return len(inside) > 1 and full_range > 0 and bool(np.ptp(inside) >= 0.1 * full_range)
 
 
 def _at_rail(values: np.ndarray, segment: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Mask (k,) of the stretches that lie on the largest or smallest value of all, and to which the signal
-    came from another value. (A machine at rest begins at its smallest.)"""
+    """Returns a mask (k,) of the stretches at the largest or smallest value of all that the signal reached
+    from another value. (A machine at rest begins at its smallest value.)"""
     if not len(first):
         return np.zeros(0, bool)
     came = (first > 0) & (segment[first] == segment[np.maximum(first, 1) - 1])
@@ -499,9 +504,9 @@ WINDOWS_AT_ONCE = 1000
 
 
 def mask_mixed(table: Table, signals: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Table:
-    """The table with flags for stretches of the record's own samples {signal: (time_s (n,), values (n,))} in
-    which two devices write under one name. They are masked, as nothing tells which of the two a sample is
-    of."""
+    """Returns the table with flags for stretches in which two devices write under one name. They are found in
+    the record's own samples {signal: (time_s (n,), values (n,))}. They are masked, because nothing tells
+    which device wrote a sample."""
     flags = list(table.flags)
     for name, (time_s, values) in signals.items():
         for first, last, distance in find_mixed(values):
@@ -516,11 +521,12 @@ def mask_mixed(table: Table, signals: Mapping[str, tuple[np.ndarray, np.ndarray]
 
 
 def find_mixed(values: np.ndarray) -> list[tuple[int, int, float]]:
-    """(first, last, distance) of the stretches of values (n,) whose samples belong to two courses at once,
+    """Returns (first, last, distance) of the stretches of values (n,) with samples from two courses at once,
     `distance` apart.
 
-    In each window the best parabola is taken off and the rest sorted. Two courses make two groups with a gap
-    between, and the samples change group again and again. (A step changes it once, a spike twice.)
+    In each window the best parabola is subtracted and the remainder sorted. Two courses give two groups with
+    a gap between them, and the samples change group again and again. (A step changes group once, a spike
+    twice.)
     """
     finite = np.flatnonzero(np.isfinite(values))
     y, step = values[finite], 0.0
@@ -550,7 +556,7 @@ def find_mixed(values: np.ndarray) -> list[tuple[int, int, float]]:
 
 
 def _coarse_step(y: np.ndarray) -> float:
-    """The step that a coarse sensor may explain, more than 0."""
+    """Returns the step that a coarse sensor may explain, more than 0."""
     # over one sample and over more: with two devices in turn every change from sample to sample is a jump
     step = min(COARSEST_STEP, *(least_change(y, lag) for lag in (1, 2, 3)))
     # a converter may be coarser: its levels tell, where there are more than the two of two devices at rest
@@ -558,8 +564,8 @@ def _coarse_step(y: np.ndarray) -> float:
 
 
 def _gaps(y: np.ndarray, starts: np.ndarray, parabolas: np.ndarray) -> np.ndarray:
-    """The gap between the two courses in each window, 0 for a window without two, whatever the sensor's
-    step. `parabolas` (size, 3) is an orthonormal basis of the parabolas over a window."""
+    """Returns the gap between the two courses in each window, 0 if a window does not have two; the sensor's
+    step is not yet considered. `parabolas` (size, 3): orthonormal basis of the parabolas over a window."""
     size = len(parabolas)
     windows = np.lib.stride_tricks.sliding_window_view(y, size)[starts]
     residual = windows - windows @ parabolas @ parabolas.T
@@ -578,7 +584,7 @@ def _gaps(y: np.ndarray, starts: np.ndarray, parabolas: np.ndarray) -> np.ndarra
 
 
 def _in_a_row(hit: np.ndarray, least: int) -> np.ndarray:
-    """Mask (n,) of the hits that stand in a row of at least `least`."""
+    """Returns a mask (n,) of the hits that belong to at least `least` hits in a row."""
     edges = np.flatnonzero(np.diff(np.r_[False, hit, False].astype(int)))
     long_enough = np.zeros(len(hit), bool)
     for a, b in zip(edges[::2], edges[1::2], strict=True):
@@ -587,8 +593,8 @@ def _in_a_row(hit: np.ndarray, least: int) -> np.ndarray:
 
 
 def alternate(intervals_s: np.ndarray) -> bool:
-    """Whether a long interval follows each short one, as with two clocks of one rate, one behind the
-    other."""
+    """Returns whether a long interval follows each short one, as with two clocks of equal rate, one shifted
+    against the other."""
     if len(intervals_s) < 20:
         return False
     deviation = intervals_s - intervals_s.mean()

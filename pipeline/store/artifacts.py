@@ -1,8 +1,8 @@
-"""Parquet, MCAP, JSON and text: the only module that opens an artifact.
+"""Reads and writes Parquet, MCAP, JSON and text. It is the only module that opens an artifact.
 
-Equal inputs give equal bytes: no clock, host, commit or duration is written. Every writer writes beside its
-target and renames, and `stage` does so for all that a stage writes. If anything fails, the last good
-artifacts stay.
+Equal inputs give equal bytes: no clock, host, commit or duration is written. Every writer writes a temporary
+file beside its target and then renames it. `stage` does the same for everything that a stage writes. If
+anything fails, the last good artifacts are kept.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ _fresh: ContextVar[Path | None] = ContextVar("_fresh", default=None)
 def write_table(
     path: str | Path, schema: Schema, columns: Mapping[str, np.ndarray | list | pa.Array]
 ) -> None:
-    """Columns of equal length as Parquet. The file has name and version of the schema, each field unit and
-    meaning.
+    """Writes columns of equal length as Parquet. The file holds name and version of the schema, and unit and
+    meaning of each field.
 
-    Missing floats are NaN. Raises ValueError naming the column and the row.
+    Missing floats are NaN. Raises ValueError naming the column, and the row of a bad value.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -70,9 +70,9 @@ def write_table(
 
 
 def read_table(path: str | Path, schema: Schema) -> dict[str, np.ndarray]:
-    """Columns by name: text as objects, missing floats as NaN, lists as objects.
+    """Returns the columns by name: text as objects, missing floats as NaN, lists as objects.
 
-    Raises ValueError for a table of another schema.
+    Raises ValueError if the file is missing or broken, or the table has another schema.
     """
     import numpy as np
     import pyarrow as pa
@@ -95,7 +95,7 @@ def read_table(path: str | Path, schema: Schema) -> dict[str, np.ndarray]:
 
 
 def column_names(path: str | Path) -> list[str]:
-    """The names of a table's columns; [] if there is no such file, or it is broken."""
+    """Returns the names of a table's columns; [] if the file does not exist or is broken."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -108,8 +108,9 @@ def column_names(path: str | Path) -> list[str]:
 def write_arrays(
     path: str | Path, name: str, version: int, arrays: Mapping[str, tuple[np.ndarray, str, str]]
 ) -> None:
-    """Named real arrays {name: (array, unit, meaning)} of any shape as one Parquet table. Integers and
-    booleans come back as floats."""
+    """Writes named real arrays {name: (array, unit, meaning)} of any shape as one Parquet table. Integers and
+    booleans are read back as floats. Raises ValueError if an array is not real or holds an infinite
+    number."""
     import numpy as np
 
     rows = []
@@ -138,10 +139,10 @@ def write_arrays(
 def read_arrays(
     path: str | Path, name: str, version: int, *, shapes: Mapping[str, tuple[int | None, ...]] | None = None
 ) -> dict[str, np.ndarray]:
-    """The arrays of `write_arrays`, float64 and in their shapes.
+    """Returns the arrays of `write_arrays`, float64 and in their shapes.
 
-    Raises ValueError where one has not the shape that `shapes` gives it (None: any length): it is of another
-    machine or of another run than what it is read beside.
+    Raises ValueError if an array does not have the shape that `shapes` gives (None: any length). The file
+    then belongs to another machine or to another run than the files read with it.
     """
     import numpy as np
 
@@ -174,7 +175,7 @@ def _shape(lengths: Sequence[int | None]) -> str:
 
 
 def _array(path: str | Path, column: Column, values) -> pa.Array:
-    """Values in the column's type, NaN as missing. Nothing is rounded."""
+    """Returns the values in the column's type, NaN as missing. Nothing is rounded."""
     import numpy as np
     import pyarrow as pa
 
@@ -194,15 +195,15 @@ def _array(path: str | Path, column: Column, values) -> pa.Array:
 
 
 def write_json(path: str | Path, data) -> None:
-    """Dictionaries in their order, lists, text, numbers (numpy's too), NamedTuples as dictionaries.
+    """Writes dictionaries in their order, lists, text, numbers (numpy's too), NamedTuples as dictionaries.
 
-    Raises ValueError naming the key of NaN, of infinity, or of a type that JSON does not know.
+    Raises ValueError naming the key if a value is NaN, infinite, or of a type that JSON does not have.
     """
     write_text(path, json.dumps(_plain(path, "", data), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def read_json(path: str | Path):
-    """The data of a file of `write_json`. Raises ValueError if the file is missing or broken."""
+    """Returns the data of a file of `write_json`. Raises ValueError if the file is missing or broken."""
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -215,7 +216,7 @@ def write_metrics(stage: str, figures: Mapping, metrics: Sequence[str] = ("*",))
     """Writes all figures to datasets/<stage>/figures.json, which pages and later stages read, and those that
     match `metrics` to reports/metrics/<stage>.json, which git keeps and DVC compares.
 
-    A pattern is a dotted path whose keys may hold * for any text. It takes a figure, or all figures below a
+    A pattern is a dotted path; * in a key matches any text. It selects a figure, or all figures below a
     section.
     """
     fresh = _fresh.get()
@@ -225,7 +226,8 @@ def write_metrics(stage: str, figures: Mapping, metrics: Sequence[str] = ("*",))
 
 
 def matching(figures: Mapping | list, patterns: Sequence[Sequence[str]]) -> dict | list:
-    """The figures and sections that a pattern takes, in their order. A place in a list is a key."""
+    """Returns the figures and sections that match a pattern, in their order. The index in a list counts as a
+    key."""
     from fnmatch import fnmatchcase
 
     listed = isinstance(figures, list)
@@ -240,18 +242,18 @@ def matching(figures: Mapping | list, patterns: Sequence[Sequence[str]]) -> dict
 
 
 def read_figures(stage: str) -> dict:
-    """All figures that the stage wrote with `write_metrics`."""
+    """Returns all figures that the stage wrote with `write_metrics`."""
     return read_json(DATASETS / stage / "figures.json")
 
 
 def write_learning_curve(
     folder: str | Path, columns: Mapping[str, Sequence], *, of: str, step: str, figures: Sequence[str]
 ) -> None:
-    """A training's learning curve in DVCLive's files, for `dvc plots` and other readers.
+    """Writes a training's learning curve in DVCLive's files, for `dvc plots` and other readers.
 
-    There is one file <folder>/plots/metrics/<name>/<figure>.tsv by `step` for every name in column `of`. A
-    figure that is missing at a step has no line there. (DVCLive itself is not used: it changes git and
-    dvc.yaml, and with a token set it sends to the network.)
+    For every name in column `of`, each figure has a file <folder>/plots/metrics/<name>/<figure>.tsv by
+    `step`. A figure that is missing at a step has no line there. (DVCLive itself is not used: it changes git
+    and dvc.yaml, and with a token set it sends to the network.)
     """
     lines: dict[tuple[str, str], list[str]] = {}
     for name, at, *values in zip(*(columns[key] for key in (of, step, *figures)), strict=True):
@@ -267,13 +269,13 @@ def write_learning_curve(
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """UTF-8 with Unix line ends."""
+    """Writes text in UTF-8 with Unix line ends."""
     with beside(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
 def write_lines(path: str | Path, lines: Iterable[str]) -> None:
-    """The same, line by line as they come."""
+    """Writes lines in UTF-8 with Unix line ends, one by one as they arrive."""
     with beside(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
         stream.writelines(f"{line}\n" for line in lines)
 
@@ -284,8 +286,9 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 
 def write_folder(path: str | Path, files: Mapping[str, str | bytes]) -> None:
-    """A folder below reports/ that holds exactly these files, texts in UTF-8, once the stage ends well: what
-    an earlier run left in it goes. Outside a stage it is no longer whole if a write fails."""
+    """Writes a folder below reports/ that holds exactly these files, texts in UTF-8. Inside a stage this
+    happens when the stage ends well. Files of an earlier run are removed. Outside a stage the folder is
+    incomplete if a write fails."""
     waiting = _waiting.get()
     folder = waiting / path if waiting else Path(path)
     folder.mkdir(parents=True, exist_ok=True)
@@ -300,7 +303,7 @@ def write_folder(path: str | Path, files: Mapping[str, str | bytes]) -> None:
 
 
 def write_jpeg(path: str | Path, picture: np.ndarray) -> None:
-    """A picture (h, w, 3) uint8 in RGB, at the quality of a page."""
+    """Writes a picture (h, w, 3) uint8 in RGB as JPEG of quality 80, good enough for a page."""
     import cv2
 
     done, data = cv2.imencode(
@@ -313,8 +316,8 @@ def write_jpeg(path: str | Path, picture: np.ndarray) -> None:
 
 
 def write_csv(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
-    """A CSV file of numbers and plain words for readers without Parquet: a header line of names, then one
-    line a sample, floats by repr."""
+    """Writes a CSV file of numbers and plain words for readers without Parquet: a header line of names, then
+    one line per sample, floats by repr."""
     import numpy as np
 
     arrays = [np.asarray(values) for values in columns.values()]
@@ -354,7 +357,7 @@ def _plain(path: str | Path, place: str, data):
 
 
 def exists(path: str | Path) -> bool:
-    """Whether a stage wrote this optional artifact."""
+    """Returns whether a stage wrote this optional artifact."""
     return Path(path).exists()
 
 
@@ -363,7 +366,8 @@ def exists(path: str | Path) -> bool:
 
 @contextlib.contextmanager
 def about(path: str | Path) -> Iterator[None]:
-    """Puts the file's name in front of what the body refuses, unless it stands there."""
+    """Puts the file's name at the beginning of a ValueError raised in the body, unless the message begins
+    with it."""
     try:
         yield
     except ValueError as error:
@@ -378,11 +382,11 @@ def write_recording(
     *,
     topic: str = "/machine",
 ) -> None:
-    """One MCAP file with a JSON message {signal: value, ...} on `topic` at each of time_s (T,).
+    """Writes one MCAP file with a JSON message {signal: value, ...} on `topic` at each of time_s (T,).
 
-    `signals` is {name: (values (T,), unit, meaning)}. log_time is round(1e9 time_s) ns. The channel's
-    metadata has name and version of the schema, and unit and meaning of each signal. Raises ValueError for
-    lengths that differ and for values that are not finite.
+    `signals`: {name: (values (T,), unit, meaning)}. log_time is round(1e9 time_s) ns. The channel's metadata
+    holds name and version of the schema, and unit and meaning of each signal. Raises ValueError if lengths
+    differ, if values are not finite, or if time_s is negative.
     """
     import mcap.writer
     import numpy as np
@@ -431,8 +435,8 @@ def write_recording(
 
 
 def sha256(path: str | Path) -> str:
-    """Digest of a file, or of a folder by relative names and contents. Dot files and __pycache__ do not
-    count."""
+    """Returns the digest of a file, or of a folder's relative names and contents. Files and folders with a
+    dot at the start of their name, and __pycache__, are ignored."""
     import hashlib
 
     path = Path(path)
@@ -451,11 +455,11 @@ def sha256(path: str | Path) -> str:
 
 @contextlib.contextmanager
 def stage(name: str) -> Iterator[Path]:
-    """The frame around a stage: a fresh folder becomes datasets/<name> when the body ends well, together with
-    the files that the body wrote to reports/.
+    """Runs the body of a stage. When it ends well, a fresh folder becomes datasets/<name>, and the files that
+    the body wrote to reports/ take their places.
 
-    Bad input (ValueError, LinAlgError, OSError, Arrow's errors) and the end of the memory end the process
-    with status 1 and one line, and change no file.
+    Bad input (ValueError, LinAlgError, OSError, Arrow's errors) or lack of memory ends the process with
+    status 1 and one line, and changes no file.
     """
     folder, retired, waiting = (DATASETS / f".{name}.{os.getpid()}{end}" for end in ("", ".old", ".reports"))
     tokens = _waiting.set(waiting), _fresh.set(folder)
@@ -495,8 +499,8 @@ def _drop_others(names: Iterable[str], folder: Path) -> None:
 
 
 def _replace(folder: Path, retired: Path, target: Path) -> None:
-    """Puts `folder` in the place of `target`; if the second rename fails, `target` stays what it was. A stage
-    that wrote only to reports/ has no folder."""
+    """Moves `folder` to `target`. If the second rename fails, the old `target` is put back. A stage that
+    wrote only to reports/ has no folder."""
     filled = any(folder.iterdir())
     if target.exists():
         target.rename(retired)
@@ -510,7 +514,7 @@ def _replace(folder: Path, retired: Path, target: Path) -> None:
 
 
 def _tidy(name: str) -> None:
-    """Removes what killed runs left, and puts back the folder of a run that was killed between its two
+    """Removes what killed runs left behind. Puts back the folder of a run that was killed between its two
     renames."""
     for left in DATASETS.glob(f".{name}.*"):
         ending = re.fullmatch(r"\.(\d+)(\.old|\.reports)?", left.name.removeprefix(f".{name}"))
@@ -534,8 +538,8 @@ def _alive(pid: int) -> bool:
 
 @contextlib.contextmanager
 def beside(path: str | Path) -> Iterator[Path]:
-    """A temporary file that takes the target's place when the body ends well. Inside a stage, a file in
-    reports/ waits for the stage's end."""
+    """Gives a temporary file that replaces the target when the body ends well. Inside a stage, a file in
+    reports/ is kept until the stage ends well."""
     target, waiting = Path(path), _waiting.get()
     place = waiting / target if waiting and target.parts[0] == REPORTS.name else target
     temporary = place.with_name(f".{place.name}.{os.getpid()}")
@@ -556,8 +560,8 @@ def beside(path: str | Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def together(folder: Path) -> Iterator[Path]:
-    """A folder inside this one, whose files take their places in it when the body ends well: all or none.
-    What killed calls left is removed."""
+    """Gives a folder inside this one. When the body ends well, its files are moved up into `folder`: all or
+    none. Remains of killed calls are removed."""
     for left in folder.glob(".together.*"):
         pid = left.suffix[1:]
         if pid.isdigit() and not _alive(int(pid)):
@@ -575,7 +579,7 @@ def together(folder: Path) -> Iterator[Path]:
 
 
 def _on_disk(path: Path) -> None:
-    """Waits until a file, or the names in a folder, would outlast a power cut; some 5 ms each."""
+    """Waits until a file, or the names in a folder, would survive a power cut; about 5 ms each."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -592,7 +596,7 @@ def _mend(error: OSError, folder: Path) -> str:
 
 
 def remedy(path: str | Path) -> str:
-    """The command that makes the artifact again. The path names the stage."""
+    """Returns the command that makes the artifact again. The path names the stage."""
     parts = Path(path).parts
     if parts[:2] == ("reports", "metrics"):
         return f"make it again with ./run dvc repro {Path(path).stem}"
@@ -605,7 +609,7 @@ def remedy(path: str | Path) -> str:
 
 
 def reason(error: Exception) -> str:
-    """The error in one line. An operating system's error and the end of the memory become words and
+    """Returns the error in one line. Errors of the operating system and lack of memory are explained, with a
     remedy."""
     text = str(error) or type(error).__name__
     if isinstance(error, MemoryError) or _out_of_memory(error):
@@ -623,15 +627,16 @@ def _is_of_arrow(error: Exception) -> bool:
 
 
 def _out_of_memory(error: Exception) -> bool:
-    """Whether a library ran out of memory: XLA and C++ say so by RuntimeError, OpenCV by its own error."""
+    """Returns whether a library ran out of memory: XLA and C++ report it by RuntimeError, OpenCV by its own
+    error."""
     return any(words in str(error) for words in OUT_OF_MEMORY)
 
 
 def write_weights(
     path: str | Path, name: str, arrays: Mapping[str, np.ndarray], about: Mapping[str, str]
 ) -> None:
-    """Writes arrays of any shape and kind, bit by bit, with `about`: what a reader must know to use them.
-    Equal arrays give equal bytes."""
+    """Writes arrays of any shape and type without changing a bit, and `about`: what a reader must know to use
+    them. Equal arrays give equal bytes."""
     import numpy as np
     from safetensors.numpy import save_file
 
@@ -645,8 +650,8 @@ def write_weights(
 
 
 def read_weights(path: str | Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Arrays and `about` of `write_weights`. Raises ValueError if the file is missing, broken, or of another
-    schema."""
+    """Returns arrays and `about` of `write_weights`. Raises ValueError if the file is missing, broken, or of
+    another schema."""
     import safetensors
     from safetensors.numpy import load_file
 

@@ -1,4 +1,4 @@
-"""Work over recordings, seeds and data sets -> processes of this machine (loky) or of a dask cluster, by
+"""Runs work over recordings, seeds and data sets in processes of this machine (loky) or of a dask cluster, by
 section `execution` of params.yaml."""
 
 import contextlib
@@ -25,12 +25,12 @@ PACKAGES = ("numpy", "scipy", "jaxlib", "opencv-python-headless", "pyarrow", "sc
 def run_all(
     calls: Sequence[tuple[Callable, tuple, dict]], execution: Execution, *, remains: str = ""
 ) -> Iterator[Any]:
-    """The results of calls made with joblib.delayed, in their order, as they come. Both back ends give the
-    same results.
+    """Yields the results of calls made with joblib.delayed, in their order, as they become available. Both
+    back ends give the same results.
 
-    The workers of a cluster have the same code, packages and pins, and the same file system, under absolute
-    paths. `remains` says what a killed run leaves behind. Raises ValueError if workers are killed over and
-    over, if one differs from this process, or if there is no cluster.
+    The workers of a cluster must have the same code, packages and pins, and the same file system, under
+    absolute paths. `remains`: what a killed run leaves behind. Raises ValueError if workers are killed
+    repeatedly, if one differs from this process, or if there is no cluster.
     """
     if execution.backend == "dask" and calls:
         with _cluster(execution.scheduler, remains) as client:
@@ -59,7 +59,7 @@ def run_all(
 
 class Surroundings(NamedTuple):
     """What the bytes of a result depend on besides its call: SHA-256 of pipeline/, versions of PACKAGES, and
-    PINS, where they are set."""
+    those of PINS that are set."""
 
     code: str
     packages: dict[str, str]
@@ -68,14 +68,16 @@ class Surroundings(NamedTuple):
 
 @functools.cache
 def surroundings() -> Surroundings:
-    """Those of this process when it was first asked: a worker keeps the code that it has once imported."""
+    """Returns the surroundings of this process at the first call, because a worker keeps the code that it has
+    imported."""
     packages = {name: importlib.metadata.version(name) for name in PACKAGES}
     pins = {name: os.environ[name] for name in PINS if name in os.environ}
     return Surroundings(artifacts.sha256(CODE), packages, pins)
 
 
 def _there(call: bytes, asked: Surroundings) -> Any:
-    """What a pickled call gives in a worker. Raises ValueError where that is not as asked."""
+    """Returns the result of a pickled call in a worker. Raises ValueError if the worker's surroundings are
+    not those `asked`."""
     if others := _differences(asked, surroundings()):
         import distributed
 
@@ -89,7 +91,7 @@ def _there(call: bytes, asked: Surroundings) -> Any:
 
 
 def _differences(asked: Surroundings, found: Surroundings) -> list[str]:
-    """What is found in a worker, beside what was asked for."""
+    """Returns the differences of a worker's surroundings from the required ones."""
     told = ["another pipeline/, or one of before a change"] if asked.code != found.code else []
     for wanted, there in ((asked.packages, found.packages), (asked.pins, found.pins)):
         told += [
@@ -102,7 +104,8 @@ def _differences(asked: Surroundings, found: Surroundings) -> list[str]:
 
 @contextlib.contextmanager
 def _cluster(scheduler: str, remains: str) -> Iterator[Any]:
-    """A client of the cluster of this address. A failure of the cluster is one sentence."""
+    """Gives a client of the cluster with this address. Raises ValueError, one sentence, if the cluster
+    fails."""
     try:
         import distributed
     except ImportError:

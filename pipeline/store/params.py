@@ -1,9 +1,9 @@
-"""A section of params.yaml and params.expert.yaml -> a frozen, bounded, typed object.
+"""Reads a section of params.yaml and params.expert.yaml as a frozen, bounded, typed object.
 
-Each problem with a section becomes one sentence that ends with the remedy. params.yaml has what the owner of
-a machine decides, params.expert.yaml what a developer of a method sets. A section may stand in both files, a
-key of it in one. A path to params.yaml means both files: the other one lies beside it. Sections of the user's
-own begin with x_.
+Each problem with a section becomes one sentence that ends with the remedy. params.yaml holds what the owner
+of a machine decides, params.expert.yaml what a developer of a method sets. A section may be in both files,
+but each of its keys in only one. A path to params.yaml means both files, because the other one is in the same
+folder. The user's own sections begin with x_.
 """
 
 import json
@@ -119,18 +119,18 @@ S = TypeVar("S", bound=Section)
 
 
 def load(model: type[S], section: str, path: str | Path = FILE) -> S:
-    """Section `section` of both files as a frozen `model`.
+    """Returns section `section` of both files as a frozen `model`.
 
     Raises ValueError with a line for each key that is unknown, renamed, missing or out of bounds, and for
-    each section, this or another, that is none of SECTIONS.
+    each section of the files that is not in SECTIONS.
     """
     _check_names(path)
     return _load(model, section, path)
 
 
 def check(models: Mapping[str, type[Section]], path: str | Path = FILE) -> None:
-    """Checks the sections that `models` names by these models. Raises ValueError with a line for each problem
-    of the two files."""
+    """Checks each section named in `models` with its model. Raises ValueError with a line for each problem of
+    the two files."""
     problems = _problems_of_names(path)
     misspelt = {_nearest(name, models) for name in {*read(path)}.difference(models)}
     for section, model in models.items():
@@ -160,7 +160,8 @@ def _load(model: type[S], section: str, path: str | Path) -> S:
 
 
 def value(dotted: str, path: str | Path = FILE, *, one_of: tuple) -> Any:
-    """One key of another stage's section, such as generate_probing.source; its value is one of `one_of`.
+    """Returns one key of another stage's section, such as generate_probing.source; its value must be one of
+    `one_of`.
 
     Raises ValueError as `load` does.
     """
@@ -184,7 +185,7 @@ def value(dotted: str, path: str | Path = FILE, *, one_of: tuple) -> Any:
 
 
 def home(dotted: str, path: str | Path = FILE) -> str:
-    """The file in which a key such as train_agent.seed stands, "" where it stands in none."""
+    """Returns the file that has a key such as train_agent.seed, "" if neither has it."""
     for name, values in files(path).items():
         for key in dotted.split("."):
             if not isinstance(values, dict) or key not in values:
@@ -196,9 +197,9 @@ def home(dotted: str, path: str | Path = FILE) -> str:
 
 
 def read(path: str | Path = FILE) -> dict:
-    """Every section with its keys of both files, unchecked.
+    """Returns every section with its keys from both files, unchecked.
 
-    Raises ValueError as `files` does, and for a key of a section that stands in both.
+    Raises ValueError as `files` does, and if a key of a section is in both files.
     """
     (name, merged), *others = files(path).items()
     for other, sections in others:
@@ -217,9 +218,10 @@ def read(path: str | Path = FILE) -> dict:
 
 
 def files(path: str | Path = FILE) -> dict[str, dict]:
-    """{file: its sections} of params.yaml and of params.expert.yaml beside it if there is one, unchecked.
+    """Returns {file: its sections} for params.yaml and, if it exists, for params.expert.yaml in the same
+    folder, unchecked.
 
-    Raises ValueError with file and line for a file that is no YAML or has a key twice.
+    Raises ValueError with file and line if a file is not YAML or has a key twice.
     """
     from pipeline.store import params_text
 
@@ -259,7 +261,7 @@ def _check_names(path: str | Path) -> None:
 
 
 def _problems_of_names(path: str | Path) -> list[str]:
-    """A sentence for each section that no code reads."""
+    """Returns a sentence for each section that no code reads."""
     return [
         f"{file}: {_no_section(str(name))}"
         for file, sections in files(path).items()
@@ -270,8 +272,8 @@ def _problems_of_names(path: str | Path) -> list[str]:
 
 
 def _files_of(sections: dict[str, dict], section: str, location: Sequence = ()) -> str:
-    """The file in which a key stands. For a missing key, and for the section itself, the files that have the
-    section."""
+    """Returns the file that has a key. For a missing key, and for the section itself, returns the files that
+    have the section."""
     having = [name for name, names in sections.items() if section in names] or list(sections)
     exact = [name for name in having if location and location[0] in sections[name].get(section, {})]
     return (" or " if location else " and ").join(exact or having)
@@ -298,8 +300,8 @@ _TYPES = {
 
 
 def _sentences(model: type[Section], section: str, errors: list) -> Iterator[tuple[tuple, str]]:
-    """(location, sentence) of each problem; a misspelt or renamed key is one problem, not one unknown and one
-    missing key."""
+    """Yields (location, sentence) of each problem. A misspelt or renamed key is one problem, not an unknown
+    key and a missing one."""
     explained = set()
     for error in errors:
         if error["type"] == "extra_forbidden":
@@ -372,7 +374,7 @@ def _shown(value: Any) -> str:
 
 
 def _nearest(name: Any, names) -> str:
-    """The name that is most like `name`, "" where none is."""
+    """Returns the name that is most like `name`, "" if none is similar."""
     import difflib
 
     matches = difflib.get_close_matches(str(name), [str(other) for other in names], n=1, cutoff=0.6)
@@ -380,7 +382,7 @@ def _nearest(name: Any, names) -> str:
 
 
 def _choice_remedy(value: Any, choices) -> str:
-    """The choice that is most like a value that is none of them."""
+    """Returns the words that suggest the allowed choice most like a refused value, "" if none is similar."""
     words = re.findall(r"'([^']*)'", choices) if isinstance(choices, str) else choices
     near = _nearest(value, words)
     return f"; did you mean {near}?" if near else ""
@@ -391,8 +393,8 @@ def _listed(names) -> str:
 
 
 def _at(model: Any, location: tuple) -> Any:
-    """The type that the schema has at a location: a Section, an
-    element's type, or the field itself at the end."""
+    """Returns the type that the schema has at a location: a Section, the type of an element or, at the end,
+    of the field itself."""
     for key in location:
         if isinstance(model, type) and issubclass(model, Section):
             model = model.model_fields[key].annotation if key in model.model_fields else None
@@ -409,8 +411,8 @@ def _at(model: Any, location: tuple) -> Any:
 
 
 def _expected(model: type[Section], location: tuple) -> str:
-    """What a missing key should be: "int, at least 1 and at most 20",
-    "one of loky, dask", "section with name, unit"."""
+    """Returns what a missing key should be: "int, at least 1 and at most 20", "one of loky, dask", "section
+    with name, unit"."""
     kind = _at(model, location)
     if typing.get_origin(kind) is Literal:
         return "one of " + _listed(typing.get_args(kind))

@@ -1,4 +1,5 @@
-"""The pins that `run` exports: equal inputs give equal bytes only if every library sums in the same order."""
+"""The environment variables (pins) that `run` exports. Equal inputs give equal bytes only if every library
+sums in the same order."""
 
 import os
 from pathlib import Path
@@ -15,7 +16,7 @@ PINS = (*THREADS, *INSTRUCTIONS, "OPENCV_CPU_DISABLE")
 
 
 def check_pins(stage: str) -> None:
-    """Raises ValueError if a pin of this machine is not set."""
+    """Raises ValueError if a pin that this machine needs is not set."""
     missing = [name for name in (*THREADS, *INSTRUCTIONS) if name not in os.environ]
     if missing and (missing[0] in THREADS or _has_avx2()):
         raise ValueError(
@@ -25,7 +26,7 @@ def check_pins(stage: str) -> None:
 
 
 def _has_avx2() -> bool:
-    """Whether the CPU has AVX2 and FMA, told as `run` tells it."""
+    """Returns whether the CPU has AVX2 and FMA, found in the same way as in `run`."""
     try:
         with Path(os.environ.get("BEADLINE_CPUINFO", "/proc/cpuinfo")).open(encoding="utf-8") as lines:
             flags = next((line.split() for line in lines if line.startswith("flags")), [])

@@ -1,4 +1,4 @@
-"""Text that came with somebody's file, as a terminal and a page may show it."""
+"""Makes text from a user's file safe to show in a terminal and on a page."""
 
 import re
 
@@ -13,17 +13,17 @@ _IN_JSON = re.compile(
 
 
 def printable(text: str) -> str:
-    r"""The text with its control characters written out: \x1b, \u202e."""
+    r"""Returns the text with its control characters written out: \x1b, \u202e."""
     return _UNSEEN.sub(lambda found: _written_out(ord(found[0])), text)
 
 
 def counted(number: int, one: str, many: str = "") -> str:
-    """ "1 frame", "20 frames"."""
+    """Returns "1 frame", "20 frames"."""
     return f"{number:,} {one if number == 1 else many or one + 's'}"
 
 
 def printable_page(page: str) -> str:
-    """A page without control characters, also in the JSON that its scripts read."""
+    """Returns a page without control characters, also in the JSON that its scripts read."""
     return _IN_JSON.sub(r"\\\\u", printable(page))
 
 

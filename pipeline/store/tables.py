@@ -1,6 +1,6 @@
-"""A table against its schema: columns with type, unit, meaning and range, and a version.
+"""Checks a table against its schema: columns with type, unit, meaning and range, and a version.
 
-What does not fit is refused by column and row.
+Errors name the column and, for a value, the row.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def bytes_of(length: int) -> str:
 
 
 def arrow_type(kind: str) -> pa.DataType:
-    """Arrow's type of this name."""
+    """Returns Arrow's type of this name."""
     import pyarrow as pa
 
     name, _, length = kind.rstrip(">]").partition("<" if kind.startswith("list<") else "[")
@@ -60,7 +60,7 @@ def arrow_type(kind: str) -> pa.DataType:
 
 
 def arrow(schema: Schema) -> pa.Schema:
-    """Arrow's schema: name and version in its metadata, unit and meaning in each field's."""
+    """Returns Arrow's schema: name and version in its metadata, unit and meaning in each field's."""
     import pyarrow as pa
 
     fields = [
@@ -71,7 +71,7 @@ def arrow(schema: Schema) -> pa.Schema:
 
 
 def check(path: str | Path, schema: Schema, table: pa.Table, remedy: str) -> None:
-    """Refuses a table of another schema or version, with other columns or types, or with values that its
+    """Raises ValueError if a table has another schema or version, other columns or types, or values that its
     columns do not allow. `remedy` ends the sentence."""
     metadata = {key.decode(): text.decode() for key, text in (table.schema.metadata or {}).items()}
     name, version = metadata.get("schema"), metadata.get("schema_version")
@@ -95,7 +95,7 @@ def check(path: str | Path, schema: Schema, table: pa.Table, remedy: str) -> Non
 
 
 def check_names(path: str | Path, schema: Schema, names: Collection[str], remedy: str) -> None:
-    """Refuses a table that lacks columns or has others."""
+    """Raises ValueError if a table lacks columns or has others."""
     expected = [column.name for column in schema.columns]
     missing = [name for name in expected if name not in names]
     extra = [name for name in names if name not in expected]
@@ -109,7 +109,7 @@ def check_names(path: str | Path, schema: Schema, names: Collection[str], remedy
 
 
 def check_values(path: str | Path, schema: Schema, table: pa.Table, remedy: str) -> None:
-    """Refuses missing values, infinities and values out of range, with the row."""
+    """Raises ValueError with the row if a value is missing, infinite or out of range."""
     import pyarrow.compute as pc
 
     for column in schema.columns:

@@ -1,5 +1,5 @@
-"""The controllers of the temperature loop as verdicts and pages name them, from the table of controllers. One
-that the table does not know goes by its own name."""
+"""Names the controllers of the temperature loop for verdicts and pages, from the table of controllers. A
+controller that is not in the table keeps its own name."""
 
 from pipeline.temperature.controllers.table import BY_NAME, CONTROLLERS
 
@@ -16,7 +16,7 @@ def kind(name: str) -> str:
 
 
 def in_a_sentence(name: str) -> str:
-    """ "the learned kernel", "subspace + LQG", "hold"."""
+    """Returns "the learned kernel", "subspace + LQG", "hold"."""
     text = BY_NAME[name].word if name == "printer_pid" else heading(name)
     if text.startswith(("PI", "VARX")):
         return text

@@ -1,5 +1,5 @@
-"""The verdict on the temperature loop: figures, rules and certificates -> who should run, the first rule that
-failed or is undecided, and what to do."""
+"""Makes the verdict on the temperature loop from figures, rules and certificates: which controller should
+run, the first rule that failed or is undecided, and what to do."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -49,7 +49,8 @@ DRIFT = "drift"
 
 
 def questions(rules: ReportRules, compared: Mapping[str, Any]) -> list[Question]:
-    """What every controller is asked, in its fixed order, with the limits that `compared` resolves."""
+    """Returns the questions for every controller, in their fixed order, with the limits that `compared`
+    gives."""
 
     def limit(row) -> float:
         key = row.at_most if row.at_most in RESOLVED else ""
@@ -60,7 +61,8 @@ def questions(rules: ReportRules, compared: Mapping[str, Any]) -> list[Question]
 
 
 def groups() -> dict[str, tuple[list[str], str]]:
-    """The lines of the head of a page: the rules in each, and the answers of page one that show them."""
+    """Returns the lines at the head of a page: the rules in each, and the answers of page one that show
+    them."""
     lines: dict[str, tuple[list[str], list[int]]] = {}
     for row in rows(LOOP).values():
         names, answers = lines.setdefault(row.line or row.name, ([], []))
@@ -78,8 +80,8 @@ def groups() -> dict[str, tuple[list[str], str]]:
 def rules_of(
     asked: Sequence[Question], answers: Answers, drift: Figure | Missing, name: str = "", refusal: str = ""
 ) -> list[Rule]:
-    """Every rule for one controller, drift last; `name` speaks in the sentences. A certificate that is
-    refused for `refusal` is one more rule."""
+    """Returns every rule for one controller, drift last; `name` is used in the sentences. If its certificate
+    is refused for the reason `refusal`, this is one more rule."""
     judged = [_rule(question, answers[question.key], name) for question in asked]
     refused = [Rule(CERTIFICATE, None, Missing(UNDECIDED, refusal), reason=refusal)] if refusal else []
     return [*judged, *refused, Rule(DRIFT, None, drift)]
@@ -97,7 +99,8 @@ def _rule(question: Question, figure: Figure | Missing, name: str) -> Rule:
 
 
 def passes(rules: Sequence[Rule]) -> bool:
-    """Whether a controller may run: drift alone may be open, and so may a reservation of rules.toml."""
+    """Returns whether a controller may run. Drift that is not measured or undecided does not stop it, and
+    neither does a rule that no use needs (rules.toml)."""
     return all(rule.state == PASSED or not _binding(rule) for rule in rules)
 
 
@@ -109,13 +112,13 @@ def _binding(rule: Rule) -> bool:
 
 
 def first_in(rules: Sequence[Rule]) -> Rule | None:
-    """The rule that is named: the first that failed, else the first that is open; None where the controller
-    passes."""
+    """Returns the rule to name: the first that failed, otherwise the first that is open; None if the
+    controller passes."""
     return deciding(filter(_binding, rules), FAILED_FIRST)
 
 
 def grouped(rules: Sequence[Rule]) -> list[Rule]:
-    """One rule a line of `groups`: the one that decides in it, its first where all passed."""
+    """Returns one rule per line of `groups`: the one that decides in it, or its first if all passed."""
     lines = []
     for group, (of, _) in groups().items():
         own = [rule for rule in rules if rule.name in of]
@@ -127,7 +130,7 @@ def grouped(rules: Sequence[Rule]) -> list[Rule]:
 
 
 class Standing(NamedTuple):
-    """One controller before the rules."""
+    """One controller: its answers and its rules."""
 
     name: str
     answers: Answers
@@ -139,7 +142,7 @@ class Standing(NamedTuple):
 
 
 def standings(evidence: Evidence, drift: Figure | Missing = NEVER) -> dict[str, Standing]:
-    """Every controller that was judged, in the order of simplicity, the yardstick last."""
+    """Returns every controller that was judged, in the order of simplicity, the reference last."""
     return {name: _standing(evidence, name, drift) for name in names(evidence.figures)}
 
 
@@ -157,7 +160,7 @@ def _standing(evidence: Evidence, name: str, drift: Figure | Missing) -> Standin
 
 
 def undeclared_outputs(evidence: Evidence) -> list[str]:
-    """Outputs whose lowest or highest allowed temperature nobody declared."""
+    """Returns the outputs without a declared lowest or highest allowed temperature."""
     return [output.name for output in evidence.machine.outputs if output.low is None or output.high is None]
 
 
@@ -167,8 +170,9 @@ def _unstable_sentence(figures: Figures, name: str) -> str:
 
 
 def choose(figures: Figures, held: Mapping[str, Standing], incumbent: str = "") -> str | None:
-    """Who should run: the best that passes, ties to the simpler; the incumbent if none is better beyond the
-    bands of the cost, and not the weaker of two of one structure. None if nobody passes."""
+    """Returns the controller that should run: the best that passes, the simpler one if several tie. The
+    incumbent is kept if none is better beyond the bands of the cost. If the best of the comparison does not
+    pass, the weaker of two with one structure is left out. None if no controller passes."""
     fit = [name for name, standing in held.items() if standing.passes and name not in YARDSTICKS]
     if not fit:
         return None
@@ -189,7 +193,8 @@ def _cost(standing: Standing) -> Figure:
 
 
 def closest(held: Mapping[str, Standing]) -> str:
-    """Of controllers that do not pass, the one with the fewest rules against it, then of the lowest cost."""
+    """Returns, of the controllers that do not pass, the one with the fewest rules against it, then with the
+    lowest cost."""
 
     def against(name: str) -> tuple[int, int, float]:
         states = [rule.state for rule in held[name].rules if rule.name != DRIFT]
@@ -200,8 +205,8 @@ def closest(held: Mapping[str, Standing]) -> str:
 
 
 def rival(figures: Figures, subject: str) -> str:
-    """Who stands beside the controller that the verdict is about: the other one of the pair, else its
-    model-based one."""
+    """Returns the controller to show beside the verdict's subject: the other one of the pair, or the pair's
+    model-based one if the subject is not in the pair."""
     a, b = pair_names(figures)
     return b if subject == a else a
 
@@ -212,11 +217,12 @@ def rival(figures: Figures, subject: str) -> str:
 def verdict(
     evidence: Evidence, *, drift: Figure | Missing = NEVER, incumbent: str = "", named: str = ""
 ) -> Verdict:
-    """The verdict on the temperature loop. A night adds its drift, the controller that runs today as
-    `incumbent`, and, if somebody has `named` the one that runs, the verdict is about that one alone.
+    """Returns the verdict on the temperature loop. A nightly run adds its drift and, as `incumbent`, the
+    controller that runs today. If a person has `named` the controller that runs, the verdict is about that
+    one only.
 
-    `rules` of the verdict has a line for each of `groups` with the controller that it is about and its rival.
-    A recorded machine's model comes before every rule of a controller.
+    `rules` of the verdict has a line for each of `groups`, with the controller it is about and its rival. For
+    a recorded machine, its model is judged before any rule of a controller.
     """
     judged = decide(evidence, drift, incumbent, named)
     if not evidence.recorded("generate_probing"):
@@ -227,7 +233,7 @@ def verdict(
 def decide(
     evidence: Evidence, drift: Figure | Missing = NEVER, incumbent: str = "", named: str = ""
 ) -> Verdict:
-    """The verdict before anybody asks whether the model can be trusted."""
+    """Returns the verdict without asking whether the model can be trusted."""
     figures, recorded = evidence.figures, evidence.recorded("generate_probing")
     words = words_for(recorded=recorded, quick=evidence.quick)
     held = standings(evidence, drift)
@@ -249,14 +255,14 @@ def decide(
 
 
 def _lines(rules: Sequence[Rule], theirs: Sequence[Rule]) -> tuple[tuple[Rule, ...], ...]:
-    """A line for each group of the subject's rules with the rival's beside it."""
+    """Returns a line for each group of the subject's rules, with the rival's rule beside it."""
     beside = {rule.name: rule for rule in grouped(theirs)}
     absent = Missing(OPEN, "It is asked of the controller that would be named")
     return tuple((rule, beside.get(rule.name, Rule(rule.name, None, absent))) for rule in grouped(rules))
 
 
 def _beaten(figures: Figures, held: Mapping[str, Standing]) -> str:
-    """Why the best of this record is not named, where it is one that does not pass; else ""."""
+    """Returns why the best controller of this record is not named, if it does not pass; otherwise ""."""
     best = entry(comparison(figures), "best")
     first = first_in(held[best].rules) if best in held else None
     if first is None:
@@ -362,7 +368,7 @@ def _not_passed(
 
 
 def _worst_case(figures: Figures, name: str, rule: Rule) -> str:
-    """ "Its worst case: plant 48, a ramp." """
+    """Returns a sentence such as "Its worst case: plant 48, a ramp.", "" if the case is not known."""
     key = rule.question.key if rule.question else ""
     case = entry(comparison(figures), "contestants", name, key, "worst_case")
     if not isinstance(case, Mapping) or case.get("plant") is None:
@@ -378,7 +384,7 @@ def _drift_sentence(rule: Rule) -> str:
 
 
 def _closest_limit(standing: Standing) -> str:
-    """The figure that is closest to its limit."""
+    """Returns a sentence on the figure that is closest to its limit."""
     asked = [
         (rule.question, rule.figure)
         for rule in standing.rules
@@ -402,7 +408,8 @@ def _closest_limit(standing: Standing) -> str:
 
 
 def _worst_margins(compared: Mapping[str, Any], winner: Standing) -> str:
-    """The margins of the worst plant where they are below the limits, which a tenth of plants may miss."""
+    """Returns a sentence on the worst plant's margins that are below the limits, which a tenth of plants may
+    miss."""
     parts = []
     for rule in winner.rules:
         question = rule.question
@@ -419,8 +426,8 @@ def _worst_margins(compared: Mapping[str, Any], winner: Standing) -> str:
 
 
 def trust_first(verdict: Verdict, model: Verdict) -> Verdict:
-    """The verdict on controllers that were judged on an identified model. Where that model is good for no
-    use, this comes before every rule that its figures pass or fail, and nothing is ready."""
+    """Returns the verdict on controllers that were judged on an identified model. If that model is good for
+    no use, this is stated before every rule, passed or failed, and no controller is ready."""
     if not model.decision.startswith(identification.UNTRUSTED):
         return verdict
     first = verdict._replace(lead=model.decision, reason=f"{model.lead} {model.reason}", rule="trust")

@@ -1,4 +1,5 @@
-"""Scores of the composers, learning, conformance -> whose signal to use, and whether the parts will print."""
+"""Makes the verdict on the deposition loop from the scores of the composers, the learning and the conformance
+report: whose signal to use, and whether the parts can be printed."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -67,19 +68,20 @@ NO_FORECAST = {"reason": "the conformance report has none", "trial": "run ./run 
 
 
 def phrase(name: str) -> str:
-    """ "the basis functions"; a composer without a phrase goes by its heading."""
+    """Returns the composer's name for a sentence, such as "the basis functions", or its heading if it has
+    none."""
     return USE.get(name, NAMES.get(name, name))
 
 
 def untried(figures: Figures) -> bool:
-    """Whether no trial of a real deposition machine is recorded yet."""
+    """Returns whether no trial of a real deposition machine is recorded yet."""
     learning = figures["train_ilc"]
     return isinstance(learning, Mapping) and not any("pixels" in laws for laws in learning.values())
 
 
 def of_recorded_trials(figures: Figures, tables: Mapping[str, Any]) -> dict[str, Any]:
-    """The tables of a machine whose trials are recorded: a Missing in the place of what no trial of it, or
-    only simulated trials, made."""
+    """Returns the tables of a machine that learns from recorded trials. If no trial is recorded, or a table
+    was made from simulated trials, a Missing takes the table's place."""
     scores, gap = tables["scores"], None
     if untried(figures):
         gap = Missing("not measured", "No trial is recorded yet")
@@ -89,9 +91,9 @@ def of_recorded_trials(figures: Figures, tables: Mapping[str, Any]) -> dict[str,
 
 
 class Score(NamedTuple):
-    """r.m.s. flow error in % of on-off control's, true where the machine is simulated, else the upper end of
-    its forecast; the middle of the forecast; largest volume error of a line in %; the forecast's 90 %
-    interval, and whether it may be believed."""
+    """r.m.s. flow error in % of on-off control's: the true one if the machine is simulated, otherwise the
+    upper end of its forecast; the middle of the forecast; largest volume error of a line in %; the forecast's
+    90 % interval, and whether the forecast is valid."""
 
     error: float
     predicted: float | None
@@ -102,8 +104,8 @@ class Score(NamedTuple):
 
 
 class Structure(NamedTuple):
-    """One material of one part program, its scores by composer, and
-    the composer that was chosen beforehand."""
+    """One material of one part program, its scores by composer, and the composer that was chosen
+    beforehand."""
 
     part: str
     material: str
@@ -115,36 +117,39 @@ class Structure(NamedTuple):
     trial: str = ""
 
     def judged(self) -> bool:
-        """Whether the forecast may be believed; of a part of which nothing was chosen there is none."""
+        """Returns whether the forecast is valid. True if no composer was chosen, because then there is no
+        forecast."""
         return self.chosen not in self.scores or self.scores[self.chosen].judged
 
     def unknown(self) -> bool:
-        """Whether nothing tells how the chosen composer does: its forecast is not to be believed, and the
+        """Returns whether the result of the chosen composer is unknown: its forecast is not valid, and the
         true flow is not known."""
         return not self.simulated and not self.judged()
 
     def known(self) -> Mapping[str, Score]:
-        """The scores that may be shown and compared: none if nothing tells how the chosen composer does."""
+        """Returns the scores that may be shown and compared: none if the result of the chosen composer is
+        unknown."""
         return {} if self.unknown() else self.scores
 
     def error(self, composer: str) -> float | None:
-        """The flow error of a composer; None if it has none that is known."""
+        """Returns the flow error of a composer; None if it is not known."""
         return self.known()[composer].error if composer in self.known() else None
 
     def worst_line(self, composer: str) -> float | None:
-        """The volume error of its worst line; None if no line was judged."""
+        """Returns the volume error of the composer's worst line; None if no line was judged."""
         return self.known()[composer].worst_line if composer in self.known() else None
 
     def best(self) -> str:
-        """The composer, on-off control too, with the least error; what
-        learned the part itself is a yardstick."""
+        """Returns the composer with the least error, on-off control included, "" if no error is known. The
+        one that learned the part itself is only a reference."""
         scores = self.known()
         return min(
             (name for name in COMPOSERS if name in scores), key=lambda name: scores[name].error, default=""
         )
 
     def state(self) -> str:
-        """Of the composer that was chosen, by flow, volume, and whether its forecast is judged."""
+        """Returns the state of the composer that was chosen, from its flow error, its volume error, and
+        whether its forecast is valid."""
         score = self.known().get(self.chosen)
         if score is None:
             return OPEN
@@ -158,7 +163,7 @@ class Structure(NamedTuple):
 
 @or_gap
 def structures(evidence: Evidence) -> list[Structure] | Missing:
-    """Every material of every part, in the order of the table."""
+    """Returns every material of every part, in the order of the table."""
     groups = pd.DataFrame(need(evidence.tables["scores"])).groupby(["part", "material"], sort=False)
     told = known(evidence.tables["conformance"], {})
     parts = [_structure(rows, evidence.rules, told) for _, rows in groups]
@@ -166,13 +171,14 @@ def structures(evidence: Evidence) -> list[Structure] | Missing:
 
 
 def unknown_streams(evidence: Evidence) -> set[tuple[str, str]]:
-    """(part, material) of the forecasts that nobody may show a figure of."""
+    """Returns (part, material) of the forecasts that are not valid, so that their figures must not be
+    shown."""
     return {(part.part, part.material) for part in known(structures(evidence), []) if part.unknown()}
 
 
 def _structure(rows: pd.DataFrame, rules: ReportRules, conformance: Mapping[str, Any]) -> Structure:
-    """One material of one part from its rows of the scores and its forecast in the conformance report; a
-    composer without an error is left out."""
+    """Returns one material of one part, from its rows of the scores and its forecast in the conformance
+    report. A composer without an error is left out."""
     judged = rows.dropna(subset="rms_percent_of_on_off")
     each: list[Any] = list(judged.itertuples())
     part, material = rows.part.iloc[0], rows.material.iloc[0]
@@ -205,18 +211,19 @@ def _finite(figure: float) -> float | None:
 
 
 def worst(parts: Sequence[Structure], composer: str) -> tuple[float, Structure] | None:
-    """The largest error of a composer and where."""
+    """Returns the largest error of a composer, and the part that has it."""
     return _largest(parts, lambda part: part.error(composer))
 
 
 def data_driven(parts: Sequence[Structure]) -> str:
-    """The rule of the library with the smaller worst error; the paper's if both are equal."""
+    """Returns the library's rule with the smaller worst error; the paper's rule if both are equal."""
     errors = {name: pair[0] for name in RULES_OF_LIBRARY if (pair := worst(parts, name))}
     return min(errors, key=lambda name: errors[name], default=LIBRARY)
 
 
 def winner(parts: Sequence[Structure]) -> str:
-    """The composer with the least worst error; among those as good, the simplest."""
+    """Returns the composer with the smallest worst error. Of those within SAME of it, the simplest is
+    returned."""
     errors = {name: pair[0] for name in COMPOSERS if (pair := worst(parts, name))}
     return next((name for name, error in errors.items() if error <= min(errors.values()) + SAME), "")
 
@@ -226,9 +233,10 @@ def winner(parts: Sequence[Structure]) -> str:
 
 @instead(lambda gap: PairSentence("Model-based against data-driven: not measured.", None))
 def pair_sentence(evidence: Evidence) -> PairSentence:
-    """ "the basis functions leave 0.25 of the flow error that the library by superposition leaves", on the
-    same streams, from how many prints on, and after how many prints of a part itself learning it is as good;
-    or that more parts are needed to tell."""
+    """Returns the comparison of model-based with data-driven, on the same streams: "the basis functions leave
+    0.25 of the flow error that the library by superposition leaves", or that more parts are needed. Its note
+    says from how many prints on this holds, and after how many prints of a part direct learning is as
+    good."""
     head, parts = "Model-based against data-driven:", need(structures(evidence))
     if evidence.recorded("train_ilc"):
         return PairSentence(
@@ -273,8 +281,8 @@ def pair_sentence(evidence: Evidence) -> PairSentence:
 
 
 def _turns(spent: pd.DataFrame, better: str, worse: str) -> str:
-    """Whether the answer turns with the prints that were learned from, and after how many prints of a part
-    itself learning it is as good as the better composer."""
+    """Returns whether the answer changes with the number of prints learned from, and after how many prints of
+    a part direct learning is as good as the better composer."""
     error = spent.pivot_table(
         index=["part", "material", "prints"], columns="composer", values="rms_percent_of_on_off"
     )
@@ -316,8 +324,8 @@ Pair = tuple[Rule, Rule]
 
 
 class Parts(NamedTuple):
-    """What the rules of one composer are asked of: the parts, those that the drive can follow, and the least
-    error in % of on-off control's that any command leaves of the others, by part and material."""
+    """The input of the rules of one composer: the evidence; the parts; and, for the streams that the drive
+    cannot follow, the least error in % of on-off control's that any command leaves, by part and material."""
 
     evidence: Evidence
     parts: Sequence[Structure]
@@ -333,15 +341,17 @@ class Parts(NamedTuple):
 
 
 def rules(evidence: Evidence, parts: Sequence[Structure], beside: str = LIBRARY) -> tuple[Pair, ...]:
-    """The rules of a run, of the model-based composer and of the one beside it."""
+    """Returns the rules of a run: for each a pair, that of the model-based composer and that of the one
+    beside it."""
     unknown = {(part.part, part.material) for part in parts if part.unknown()}
     bound = {place: least for place, least in _bound(evidence).items() if place not in unknown}
     return rules_of(Parts(evidence, parts, bound), beside)
 
 
 def rules_of(case: Parts, beside: str = LIBRARY) -> tuple[Pair, ...]:
-    """The drive first, then what may be believed. If the drive cannot follow, a signal is held against the
-    best that any command could reach within it, else against the flow that is wanted."""
+    """Returns the rules: the drive first, then whether the forecasts are valid. If the drive cannot follow, a
+    signal is compared with the best that any command within the drive's limits could reach, otherwise with
+    the wanted flow."""
     asked = [key for key in rows(LOOP) if key != "near" or case.bound]
     return tuple((_rule(case, key, OURS), _rule(case, key, beside)) for key in asked)
 
@@ -356,14 +366,14 @@ def _rule(case: Parts, key: str, composer: str) -> Rule:
 
 
 def _open(text: str = OPEN, reason: str = "", **words: str) -> Reading:
-    """The reading of a figure that is not known."""
+    """Returns the reading of a figure that is not known."""
     return Missing(OPEN, ""), {"text": text, "reason": reason, **words}
 
 
 def _largest(
     parts: Sequence[Structure], value: Callable[[Structure], float | None]
 ) -> tuple[float, Structure] | None:
-    """The largest value of the parts that have one, and where."""
+    """Returns the largest value of the parts that have one, and its part."""
     known = [(figure, part) for part in parts if (figure := value(part)) is not None]
     return max(known, key=lambda pair: pair[0], default=None)
 
@@ -374,7 +384,7 @@ def _worst_of(
     worded: Callable[[float], str] = lambda value: percent(value, 2),
     shown: Callable[[str], str] = str,
 ) -> Reading:
-    """The largest value of the parts; open if one of the parts is not known."""
+    """Returns the reading of the parts' largest value; open if one of the parts is unknown."""
     if any(part.unknown() for part in parts):
         return _open(NOT_JUDGED, remedy="")
     pair = _largest(parts, value)
@@ -393,7 +403,8 @@ def _line(case: Parts, composer: str) -> Reading:
 
 
 def _near(case: Parts, composer: str) -> Reading:
-    """If the drive cannot follow: the error over the least that any command within it leaves."""
+    """Returns the reading if the drive cannot follow: the error divided by the least error that any command
+    within the drive's limits leaves."""
 
     def ratio(part: Structure) -> float | None:
         error = part.error(composer)
@@ -412,7 +423,8 @@ def _near(case: Parts, composer: str) -> Reading:
 
 
 def _above(case: Parts, composer: str) -> Reading:
-    """By how many points a composer lies above what learned the part itself, at most."""
+    """Returns the reading of the largest difference, in points, between a composer's error and that of direct
+    learning of the part."""
 
     def above(part: Structure) -> float | None:
         error, reached = part.error(composer), part.error(REFERENCE)
@@ -430,8 +442,8 @@ def _above(case: Parts, composer: str) -> Reading:
 
 
 def _forecast(case: Parts, composer: str) -> Reading:
-    """Whether every forecast may be believed; open if one is not judged, simulated or not: a simulation does
-    not pass what would not be printed on a machine without another trial."""
+    """Returns the reading of whether every forecast is valid. It is open if one is not, also for a simulated
+    machine: on a real machine this part would not be printed without another trial."""
     doubtful = [part for part in case.parts if not part.judged()]
     if not case.parts:
         return _open(reason="No part was composed.")
@@ -463,21 +475,21 @@ def _learning(case: Parts, composer: str) -> Reading:
 
 
 def _each(evidence: Evidence, key: str) -> list[float]:
-    """A figure of every material that has it."""
+    """Returns a figure of every material that has it."""
     figures = [lookup(material, key) for material in known(evidence.figures["train_ilc"], {}).values()]
     return [float(value) for value in figures if not gap_of(value)]
 
 
 def gamma(evidence: Evidence) -> dict[str, float] | None:
-    """Of the paper's law, before anything ran: nominal, worst of the family, and the share of it above 1 in
-    %, each the worst of all materials."""
+    """Returns gamma of the paper's law before any trial: nominal, worst of the plausible models, and the
+    share of these above 1 in %. Each is the worst of all materials. None if one of them is missing."""
     figures = {key: _each(evidence, key) for key in ("gamma", "gamma_worst", "gamma_above_1_percent")}
     return {key: max(values) for key, values in figures.items()} if all(figures.values()) else None
 
 
 def _convergence(case: Parts, composer: str) -> Reading:
-    """Ours is tested once its first trials have identified the machine, over the machines that these cannot
-    tell apart."""
+    """Returns the reading of gamma. Our law is tested after its first trials have identified the machine,
+    over all machines that these trials cannot tell apart."""
     if KIND[composer] != "data-driven":
         values, absent = (
             _each(case.evidence, "gamma_model_inverse_worst"),
@@ -492,8 +504,8 @@ def _convergence(case: Parts, composer: str) -> Reading:
 
 
 class Asked(NamedTuple):
-    """One stream of a part: the largest command (mm) and speed (mm/s) that it asks for, the drive's limits
-    beside them (None: not declared), the share of its time at a limit in %, and whether the drive follows."""
+    """One stream of a part: the largest command (mm) and speed (mm/s) that it needs, the drive's limits
+    (None: not declared), the share of its time at a limit in %, and whether the drive can follow."""
 
     part: str
     material: str
@@ -505,18 +517,19 @@ class Asked(NamedTuple):
     enough: bool
 
     def text(self) -> str:
-        """Largest command and speed."""
+        """Returns the largest command and speed."""
         return f"{short(self.command_mm, 2)}{THIN}mm, {short(self.speed_mm_per_s, 2)}{THIN}mm/s"
 
     def limit(self) -> str:
-        """The drive's own."""
+        """Returns the drive's limits, "declared" if there are none."""
         if self.amplitude_mm is None or self.limit_mm_per_s is None:
             return "declared"
         return f"{self.amplitude_mm:g}{THIN}mm, {self.limit_mm_per_s:g}{THIN}mm/s"
 
 
 def asked_of_the_drive(part: str, material: str, saturation: Mapping[str, Any]) -> Asked:
-    """One stream out of the conformance report of its part; nan where an earlier version wrote it."""
+    """Returns one stream from the conformance report of its part. Values that an earlier version did not
+    write are NaN."""
     limits = (saturation.get(key) for key in ("amplitude_mm", "speed_mm_per_s"))
     return Asked(
         part,
@@ -530,7 +543,7 @@ def asked_of_the_drive(part: str, material: str, saturation: Mapping[str, Any]) 
 
 
 def _drive(case: Parts, composer: str) -> Reading:
-    """Whether the drive follows every command as it is asked for; open until a drive is declared."""
+    """Returns the reading of whether the drive can follow every command; open until a drive is declared."""
     conformance = need(case.evidence.tables["conformance"])
     saturations = {
         (part, material): saturation
@@ -581,8 +594,8 @@ def _drive(case: Parts, composer: str) -> Reading:
 
 
 def _bound(evidence: Evidence) -> dict[tuple[str, str], float]:
-    """The least error in % of on-off control's that any command leaves, by part and material, of the streams
-    that the drive cannot follow."""
+    """Returns the least error in % of on-off control's that any command leaves, by part and material, for the
+    streams that the drive cannot follow."""
     return {
         (part, material): float(saturation["least_percent"])
         for part, report in known(evidence.tables["conformance"], {}).items()
@@ -630,8 +643,8 @@ FIGURES: dict[str, Callable[[Parts, str], Reading]] = {
 
 
 def verdict(evidence: Evidence) -> Verdict:
-    """Whose signal to use: the composer with the least worst error; then the rules, for it. `winner` is the
-    composer, "" if nothing was composed; `note` is the price of the signals."""
+    """Returns the verdict on whose signal to use: the composer with the smallest worst error is judged by the
+    rules. `winner` is this composer, "" if nothing was composed; `note` is the price of the signals."""
     parts, machine = structures(evidence), evidence.recorded("train_ilc")
     words = words_for(recorded=machine, quick=evidence.quick)
     if isinstance(parts, Missing):
@@ -684,7 +697,7 @@ def verdict(evidence: Evidence) -> Verdict:
 
 
 def _decision(state: str, use: str, words: Words) -> str:
-    """The decision; which composer comes closest only where that is known of any part."""
+    """Returns the decision. It says which composer comes closest only if that is known for any part."""
     if not use:
         return words.of(state)
     if state == PASSED:
@@ -693,7 +706,8 @@ def _decision(state: str, use: str, words: Words) -> str:
 
 
 def _lead(state: str, first: Rule | None, judged: int, *, condition: bool) -> str:
-    """How many rules passed, and on what condition; or the first that did not."""
+    """Returns how many rules passed, and whether some could not be judged; or the first rule that did not
+    pass."""
     if state != PASSED:
         if first is None:
             return "Nothing beats on\u2011off control."
@@ -703,7 +717,7 @@ def _lead(state: str, first: Rule | None, judged: int, *, condition: bool) -> st
 
 
 def _summary(parts: Sequence[Structure], use: str, machine: bool) -> str:
-    """The composer in use with its worst figure, in % of on-off control's, and its worst line."""
+    """Returns the largest error of the composer in use, in % of on-off control's, and its worst line."""
     found = worst(parts, use)
     if found is None:
         return "What the parts come to is not known."
@@ -732,8 +746,8 @@ def _bare(name: str) -> str:
 
 
 def _price(evidence: Evidence, parts: Sequence[Structure]) -> str:
-    """What the signals cost: trials, peak command, what the paper's law would have done,
-    and the lines that the priority rule would lose."""
+    """Returns what the signals cost: trials, peak command, what the paper's law would have done, and the
+    lines that the priority rule would not print."""
     learning, sentences = known(evidence.figures["train_ilc"], {}).values(), []
     learned = [laws[law] for laws in learning for law in ("model_inverse", "pixels") if law in laws]
     if learned:

@@ -1,4 +1,4 @@
-"""What a verdict is made from, and how a figure is found in it."""
+"""The input of a verdict, and how to find a figure in it."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ Value = TypeVar("Value")
 
 
 class Evidence(NamedTuple):
-    """Figures by stage and tables by name, each with a Missing in its place if it could not be read."""
+    """Figures by stage and tables by name. A Missing takes the place of each that could not be read."""
 
     figures: Figures
     tables: Mapping[str, Any]
@@ -30,22 +30,23 @@ class Evidence(NamedTuple):
     certified: Mapping[str, Mapping[str, Any]] = {}  # loop -> controller -> {"passed", "why"}
 
     def recorded(self, stage: str) -> bool:
-        """Whether the stage learns from recordings of a user's machine."""
+        """Returns whether the stage learns from recordings of a user's machine."""
         return self.params.get(stage, {}).get("source") == "recordings"
 
     def refusal(self, loop: str, controller: str) -> str:
-        """Why the stage `certify` refuses a controller; "" if it passed it, and if nothing is known."""
+        """Returns why the stage `certify` refuses a controller; "" if the controller passed, or if nothing is
+        known."""
         known = self.certified.get(loop, {}).get(controller)
         return str(known["why"]) if known and not known["passed"] else ""
 
 
 def switched_off(figures: Any) -> bool:
-    """Whether a stage wrote that it was not asked, because its loop is switched off."""
+    """Returns whether a stage wrote that it did not run, because its loop is switched off."""
     return isinstance(figures, Mapping) and figures.get("asked") is False
 
 
 class Absent(Exception):
-    """A figure that a rule asks for is not there; `gap` says why."""
+    """A figure that a rule needs is missing; `gap` says why."""
 
     def __init__(self, gap: Missing) -> None:
         super().__init__(gap.reason)
@@ -53,14 +54,14 @@ class Absent(Exception):
 
 
 def entry(data: Any, *names: str) -> Any:
-    """data[name][name]...; None if one of them is not there."""
+    """Returns data[name][name]...; None if one of them does not exist."""
     for name in names:
         data = data.get(name) if isinstance(data, Mapping) else None
     return data
 
 
 def lookup(data: Any, dotted: str, *, what: str = "") -> Any:
-    """data["a"]["b"] of "a.b", or the Missing that stands for it; null is missing too."""
+    """Returns data["a"]["b"] for "a.b", or the Missing in its place. A null counts as missing."""
     value = data
     for key in dotted.split("."):
         if isinstance(value, Missing):
@@ -72,30 +73,30 @@ def lookup(data: Any, dotted: str, *, what: str = "") -> Any:
 
 
 def need(value: Value | Missing) -> Value:
-    """The value itself. Raises Absent if it is a Missing."""
+    """Returns the value. Raises Absent if it is a Missing."""
     if isinstance(value, Missing):
         raise Absent(value)
     return value
 
 
 def need_figure(data: Any, dotted: str, *, what: str = "") -> Any:
-    """data["a"]["b"] of "a.b". Raises Absent if it is not there."""
+    """Returns data["a"]["b"] for "a.b". Raises Absent if it does not exist."""
     return need(lookup(data, dotted, what=what))
 
 
 def known(value: Value | Missing, otherwise: Any) -> Value:
-    """The value itself; `otherwise` if it is a Missing."""
+    """Returns the value, or `otherwise` if it is a Missing."""
     return otherwise if isinstance(value, Missing) else value
 
 
 def gap_of(value: Any) -> Missing | None:
-    """Why a value is missing; None if it is there."""
+    """Returns why a value is missing; None if it exists."""
     return value if isinstance(value, Missing) else None
 
 
 def instead(make: Callable[[Missing], Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """A decorator: what a function gives, or what `make` makes of the gap if the function needs something
-    that is absent."""
+    """Returns a decorator. The decorated function returns its own result, or `make(gap)` if it needs
+    something that is absent."""
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)

@@ -1,4 +1,4 @@
-"""The evidence of a run, read from what its stages wrote."""
+"""Reads the evidence of a run from the files of its stages."""
 
 from collections.abc import Callable
 from typing import Any
@@ -38,8 +38,9 @@ TABLES = {
 
 
 def read_evidence(stored: str = "") -> Evidence:
-    """What the stages that ran wrote; a Missing in the place of each file that is not there, or broken.
-    `stored` is the folder of the stage verdict, if what the limits make of it is there already."""
+    """Returns what the stages of the run wrote. A Missing takes the place of each file that is missing or
+    broken. `stored`: folder of the stage verdict, if the figures that it computes from the limits already
+    exist."""
     paths = FIGURES | ({"verdict": f"{stored}/figures.json"} if stored else {})
     figures = {stage: _read(path, stage, artifacts.read_json) for stage, path in paths.items()}
     off = {stage for stage in paths if switched_off(figures[stage])}

@@ -1,4 +1,4 @@
-"""Figures of the identification -> what the model may be used for: the verdict in words."""
+"""Makes the verdict on the identified model from its figures: what the model may be used for, in words."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -32,8 +32,8 @@ AHEAD, GAINS = "ahead", "gains"
 
 
 class Fit(NamedTuple):
-    """The fits of one output on the hold-out in percent: simulated, so many steps ahead, and what the last
-    value gives if it is held."""
+    """The fits of one output on the hold-out in percent: simulated; some steps ahead; and for comparison with
+    the last value held constant."""
 
     name: str
     simulated: Figure | Missing
@@ -42,7 +42,7 @@ class Fit(NamedTuple):
 
 
 def trust(evidence: Evidence) -> Verdict:
-    """Which uses the model is good for. A use is passed if each rule that it needs is passed."""
+    """Returns for which uses the model is good. A use passes if each rule that it needs passes."""
     ahead = ahead_words(evidence)
     heats = any(signal.heats for signal in evidence.machine.inputs)
     rules = {key: _rule(evidence, key) for key in rows(LOOP) if key != GAINS or heats}
@@ -86,13 +86,13 @@ def trust(evidence: Evidence) -> Verdict:
 
 
 def least_fit() -> float:
-    """Below this fit a model misses more than half of an output's movement."""
+    """Returns the fit below which a model misses more than half of an output's movement."""
     return float(rows(LOOP)["simulation"].at_least or 0)
 
 
 def _needed(key: str, rule: Rule, use: str) -> bool:
-    """Whether a use cannot pass without the rule. A gain that is forbidden by its value alone is one of
-    unknown sign or size: a reservation."""
+    """Returns whether a use cannot pass without the rule. If a gain's value is impossible but its band
+    reaches possible values, its sign or size is unknown. This is a warning only."""
     return use in rows(LOOP)[key].needed_for and not (key == GAINS and rule.state == UNDECIDED)
 
 
@@ -132,7 +132,7 @@ def _decision(uses: Mapping[str, str]) -> str:
 
 
 def fits(evidence: Evidence) -> list[Fit]:
-    """Every output's fits on the hold-out."""
+    """Returns every output's fits on the hold-out."""
     model = evidence.figures["identify_plant"]
     return [
         Fit(
@@ -147,7 +147,7 @@ def fits(evidence: Evidence) -> list[Fit]:
 
 
 def fit_figure(model: Any, key: str, name: str) -> Figure | Missing:
-    """The fit `key` of an output in percent, with its band."""
+    """Returns the fit `key` of an output in percent, with its band."""
     value = lookup(model, f"{key}.{name}")
     if gap := gap_of(value):
         if gap_of(model) or key not in ("fit_holdout_ahead", "fit_holdout_held"):
@@ -162,20 +162,20 @@ def fit_figure(model: Any, key: str, name: str) -> Figure | Missing:
 
 @instead(lambda gap: "ahead")
 def ahead_words(evidence: Evidence) -> str:
-    """ "60 s ahead"."""
+    """Returns "60 s ahead"."""
     steps = need_figure(evidence.figures["identify_plant"], "ahead_steps")
     return f"{steps * evidence.machine.sample_time_s:g}{THIN}s\u00a0ahead"
 
 
 def percent_of(figure: Figure | Missing) -> str:
-    """A fit with its unit; the state of one that is missing."""
+    """Returns a fit with its unit; its state if it is missing."""
     if isinstance(figure, Missing):
         return figure.state
     return quantity(figure.value, "%", min(decimals(figure.low, figure.high, value=figure.value), 1))
 
 
 def band_of(figure: Figure | Missing) -> str:
-    """Its ends, empty where they are one, and where it is missing."""
+    """Returns the ends of a fit's band; "" if they are equal, or if the fit is missing."""
     if isinstance(figure, Missing):
         return ""
     places = min(decimals(figure.low, figure.high, value=figure.value), 1)
@@ -193,7 +193,7 @@ def _with_band(figure: Figure) -> str:
 def _weakest(
     fits: Sequence[Fit], values: Sequence[Figure], asked: Sequence[Question]
 ) -> tuple[Fit, Figure, Question]:
-    """Of the outputs in the gravest state the one that is furthest below its limit."""
+    """Returns, of the outputs in the gravest state, the one furthest below its limit."""
     states = [state(question, value) for question, value in zip(asked, values, strict=True)]
     ended = worst_state(states)
     rows = zip(fits, values, asked, states, strict=True)
@@ -212,7 +212,8 @@ def _simulation(evidence: Evidence, question: Question) -> Reading:
 
 
 def _ahead(evidence: Evidence, question: Question) -> Reading:
-    """The bar of each output is what holding its last value gives, and the least fit."""
+    """Returns the reading of the fit some steps ahead. The limit of each output is the fit with its last
+    value held constant, but at least the least fit."""
     outputs = fits(evidence)
     values, held = (
         [need(part) for part in parts]
@@ -232,7 +233,7 @@ def _ahead(evidence: Evidence, question: Question) -> Reading:
 
 
 def _longer(question: Question, figure: Figure) -> str:
-    """How long a hold-out would decide: a band shrinks with the root of the samples."""
+    """Returns how long a hold-out would decide: a band shrinks with the root of the number of samples."""
     limit = question.limit
     reach = limit - figure.low if figure.value > limit else figure.high - limit
     away = abs(figure.value - limit)
@@ -243,7 +244,8 @@ def _longer(question: Question, figure: Figure) -> str:
 
 
 def _residuals(evidence: Evidence, rows: np.ndarray) -> Reading:
-    """How many correlations of the residuals leave their bands, and the one that leaves it furthest."""
+    """Returns the reading of how many correlations of the residuals leave their bands, and of the one that
+    leaves it furthest."""
     table = need(evidence.tables["residuals"])
     worst, excess = _worst_lag(table, rows)
     if worst is None:
@@ -277,7 +279,7 @@ def _whiteness(evidence: Evidence, question: Question) -> Reading:
 
 
 def _worst_lag(table: Mapping[str, np.ndarray], rows: np.ndarray) -> tuple[int | None, float]:
-    """The row whose correlation leaves its band furthest, and how many bands that is."""
+    """Returns the row with the correlation that leaves its band furthest, and its size in bands."""
     if not rows.any():
         return None, 0.0
     excess = np.where(
@@ -322,8 +324,8 @@ def _stability(evidence: Evidence, question: Question) -> Reading:
 
 
 def _gains(evidence: Evidence, question: Question) -> Reading:
-    """Gains of a sign or a size that physics forbids. One whose band reaches what is possible leaves the rule
-    undecided."""
+    """Returns the reading of gains with a sign or a size that physics forbids. If a band reaches possible
+    values, the rule is undecided."""
     gains = need_figure(evidence.figures["identify_plant"], "forbidden_gains")
     if not gains:
         return count_of(0), {"text": "none forbidden", "case": "none", "flagged": ""}
@@ -349,14 +351,14 @@ FIGURES = {
 
 
 def flagged_remedy(gains: Sequence[Mapping[str, Any]]) -> str:
-    """What to do before a controller is designed from the model."""
+    """Returns what to do before a controller is designed from the model."""
     remedy = rows(LOOP)[GAINS].remedy
     case = "certain" if any(gain["certain"] for gain in gains) else "possible"
     return remedy if isinstance(remedy, str) else remedy[case]
 
 
 def flagged_sentence(gains: Sequence[Mapping[str, Any]]) -> str:
-    """What physics forbids of the model, in a sentence with the gravest gain."""
+    """Returns what physics forbids in the model: a sentence with the gravest gain."""
     worst = max(gains, key=lambda gain: (gain["certain"], abs(gain["gain"])))
     places = decimals(worst["low"], worst["high"], value=worst["gain"])
     ends = band(worst["low"], worst["high"], places)

@@ -1,4 +1,4 @@
-"""The verdict of every loop that is switched on."""
+"""Makes the verdict of every loop that is switched on."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -25,24 +25,25 @@ ANSWERS: dict[str, Callable[[Evidence], PairSentence]] = {
 
 
 def verdicts(evidence: Evidence) -> dict[str, Verdict]:
-    """The verdict of each loop, by the run alone."""
+    """Returns the verdict of each loop, from the run alone."""
     on = [loop for loop in LOOPS if (evidence.params.get("loops") or {}).get(loop, True)]
     return {loop: _whole(evidence, VERDICTS[loop](evidence)) for loop in on}
 
 
 def with_model(evidence: Evidence, verdicts: Mapping[str, Verdict]) -> dict[str, Verdict]:
-    """The verdicts, and if the temperature loop is on the one on its model, as the stage writes them."""
+    """Returns the verdicts and, if the temperature loop is on, the one on its model, as the stage writes
+    them."""
     model = {identification.LOOP: identification.trust(evidence)} if "temperature" in verdicts else {}
     return {**verdicts, **model}
 
 
 def temperature(evidence: Evidence, **night: Any) -> Verdict:
-    """The verdict on the temperature loop with what a night adds."""
+    """Returns the verdict on the temperature loop with the additions of a nightly run."""
     return _whole(evidence, decide.verdict(evidence, **night))
 
 
 def _whole(evidence: Evidence, verdict: Verdict) -> Verdict:
-    """The verdict with its subject, whether it is one on simulated machines, and the loop's answer."""
+    """Returns the verdict with its subject, whether it is about simulated machines, and the loop's answer."""
     subject, answer = verdict.subject or verdict.winner or "", ANSWERS[verdict.loop](evidence)
     return verdict._replace(
         subject=subject, rehearsal=simulated(evidence, verdict.loop), answer=answer.text,
@@ -51,5 +52,5 @@ def _whole(evidence: Evidence, verdict: Verdict) -> Verdict:
 
 
 def simulated(evidence: Evidence, loop: str) -> bool:
-    """Whether a loop was judged on simulated machines."""
+    """Returns whether a loop was judged on simulated machines."""
     return not evidence.recorded(SOURCES[loop])

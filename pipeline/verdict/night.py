@@ -1,5 +1,5 @@
-"""What a night adds to the verdicts of a run: the drift of the machine, the controller that runs today, and
-the one that somebody named to run."""
+"""Adds a nightly run to the verdicts of a run: the drift of the machine, the controller that runs today, and
+the one that a person named to run."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -15,8 +15,8 @@ AGAIN = "Look at the machine; where the change is meant to stay, record it anew 
 
 
 class Drift(NamedTuple):
-    """What the rule is judged by, the word before the sentence, and which night it is from ("" before the
-    first)."""
+    """The figure that the rule is judged by, the word before the sentence, the sentence, and the night it
+    comes from ("" before the first)."""
 
     answer: Figure | Missing
     word: str
@@ -27,8 +27,9 @@ class Drift(NamedTuple):
 def verdicts(
     evidence: Evidence, stored: Mapping[str, Verdict], nightly: Any, *, named: str = ""
 ) -> dict[str, Verdict]:
-    """The verdicts of a run with what the last night measured, `nightly` (reports/metrics/nightly.json).
-    Before the first night, and if nobody is named, they are the stored ones."""
+    """Returns the verdicts of a run with the measurements of the last night, `nightly`
+    (reports/metrics/nightly.json). Before the first night, and if no controller is named, they are the stored
+    ones."""
     if LOOP not in stored or (nightly is None and not named):
         return dict(stored)
     temperature = loops.temperature(
@@ -38,14 +39,14 @@ def verdicts(
 
 
 def in_production(nightly: Any) -> str:
-    """The controller that runs, as the nightly job wrote it; "" if no night has promoted one."""
+    """Returns the controller that runs, as the nightly job wrote it; "" if no night has promoted one."""
     runs = entry(nightly, "champion", LOOP, "contestant")
     return runs if isinstance(runs, str) else ""
 
 
 def drift(nightly: Any) -> Drift:
-    """Alarm: failed. Watched: undecided. No alarm on a new recording: passed, with the parameter that moved
-    most, in percent with its 90 % band."""
+    """Returns the drift. Alarm: failed. Watched: undecided. No alarm on a new recording: passed, with the
+    parameter that changed most, in percent with its 90 % band."""
     if nightly is None:
         return Drift(NEVER, "Not measured.", NEVER.sentence(), "")
     if isinstance(nightly, Missing):

@@ -1,4 +1,4 @@
-"""Model-based against data-driven in a sentence: figures of the comparison -> words."""
+"""Compares model-based with data-driven control in a sentence, from the figures of the comparison."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,8 +12,8 @@ from pipeline.verdict.verdict import PairSentence
 
 
 def pair_names(figures: Figures) -> tuple[str, str]:
-    """The model-based controller and the data-driven one, or a second model-based one if every data-driven
-    one is refused."""
+    """Returns the model-based controller and the data-driven one, or a second model-based one if every
+    data-driven one is refused."""
     pair = entry(comparison(figures), "pair")
     if isinstance(pair, Mapping) and {"a", "b"} <= pair.keys():
         return str(pair["a"]), str(pair["b"])
@@ -21,9 +21,8 @@ def pair_names(figures: Figures) -> tuple[str, str]:
 
 
 def pair_sentence(figures: Figures) -> PairSentence:
-    """ "subspace + LQG costs 6 % less than the learned kernel on the same 60 plants (90 % interval 3-9 %, by
-    structure of the machine 4-8 %)", or that there is no difference. `difference` is that of the cheaper
-    one."""
+    """Returns the comparison in words: "subspace + LQG costs 6 % less than the learned kernel on the same 60
+    plants (90 % interval 3-9 %, by structure of the machine 4-8 %)", or that there is no difference."""
     pair = entry(comparison(figures), "pair")
     a, b = pair_names(figures)
     compared = b not in BY_NAME or BY_NAME[b].kind == "data-driven"
@@ -58,16 +57,16 @@ def pair_sentence(figures: Figures) -> PairSentence:
 
 
 def curve_sentence(figures: Figures) -> str:
-    """At which length of the record the pair changes places, or that it does not within the record; "" if
-    nothing was learned again from less of it."""
+    """Returns at which length of the record the pair changes places, or that it does not within the record;
+    "" if no controller was learned again from a part of it."""
     compared = comparison(figures)
     curve, step = entry(compared, "cost_curve"), entry(compared, "sample_time_s")
     return crossing_sentence(curve, step, "this record") if isinstance(curve, Mapping) else ""
 
 
 def crossing_sentence(curve: Mapping[str, Any], step: float, here: str) -> str:
-    """The same of a curve as record_length.curves has it; `step` is the sample time in seconds, and `here`
-    names the lengths that were tried."""
+    """Returns the same sentence for a curve of record_length.curves. `step`: sample time in seconds; `here`:
+    name of the lengths that were tried."""
     a, b = curve["pair"]
     known = [
         (length, *costs)
@@ -113,7 +112,7 @@ def _interval(pair: Mapping[str, Any]) -> str:
 
 
 def _by_structure(differences: Sequence[float]) -> str:
-    """By how much a difference in percent depends on the structure of the machine."""
+    """Returns the range of a difference in percent over the structures of the machine."""
     ends = [finite(min(differences)), finite(max(differences))] if differences else []
     if not ends or max(map(abs, ends)) > 1000:
         return ""
@@ -127,6 +126,6 @@ def _bracket(*parts: str) -> str:
 
 
 def reference_of(case: Mapping[str, Any]) -> str:
-    """ "a constant reference", "a ramp"."""
+    """Returns "a constant reference", "a ramp"."""
     kind = str(case.get("kind") or "")
     return f"a {kind}{' reference' if kind == 'constant' else ''}" if kind else ""

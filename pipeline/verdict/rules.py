@@ -1,4 +1,4 @@
-"""A row of rules.toml held against a figure -> a rule with its state and its sentences."""
+"""Applies a row of rules.toml to a figure and makes a rule with its state and its sentences."""
 
 import functools
 import math
@@ -23,11 +23,11 @@ Limit = float | str
 
 
 class Row(params.Section):
-    """A rule. `figure` is a dotted path into the figures of a stage (datasets/<stage>/figures.json), with *
-    for the worst of several and {controller} for a controller's own; or the name of a function of its loop.
+    """A rule. `figure`: a dotted path into the figures of a stage (datasets/<stage>/figures.json), with * for
+    the worst of several and {controller} for a controller's own; or the name of a function of its loop.
 
-    Its limit is a number, or the key of section `report` that holds one, times `scale`. `needed_for` are the
-    uses that it keeps from passing. `fails` and `remedy` are sentences, or a sentence for each case.
+    Its limit is a number, or the key of section `report` that holds one, times `scale`. `needed_for`: the
+    uses that need this rule to pass. `fails` and `remedy`: a sentence, or a sentence for each case.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Row(params.Section):
     beyond: str = "never"  # an infinite figure in words
 
     def limit(self, limits: ReportRules) -> float:
-        """The limit that is declared; infinite where the key is null."""
+        """Returns the declared limit; infinite if the key is null."""
         (declared,) = [limit for limit in (self.at_least, self.at_most, self.below) if limit is not None]
         value = getattr(limits, declared) if isinstance(declared, str) else declared
         if value is None:
@@ -57,14 +57,14 @@ class Row(params.Section):
         return math.nextafter(value, -math.inf) if self.below is not None else value * self.scale
 
     def question(self, key: str, limit: float) -> Question:
-        """What the rule asks."""
+        """Returns the question that the rule asks."""
         at_least = self.at_least is not None
         return Question(
             self.answer, key, self.title or self.name, self.unit, limit, at_least, self.name, self.beyond
         )
 
     def limit_text(self, limit: float) -> str:
-        """ "≤ 6 %"."""
+        """Returns the limit as a page shows it, such as "≤ 6 %"."""
         sign = "≥" if self.at_least is not None else "≤" if self.below is None else "<"
         text = self.allowed or f"{sign} {{limit:g}}{THIN if self.unit else ''}{self.unit}"
         return text.format(limit=limit)
@@ -121,7 +121,7 @@ def _row(path: Path, loop: str, key: str, fields: Mapping[str, Any]) -> Row:
 
 
 def rows(loop: str) -> dict[str, Row]:
-    """The rules of a loop, in the order in which they are asked, by their keys."""
+    """Returns the rules of a loop by their keys, in the order in which they are applied."""
     return _rows(PATH).get(loop, {})
 
 
@@ -129,8 +129,8 @@ def rows(loop: str) -> dict[str, Row]:
 
 
 def at_path(figures: Figures, path: str, *, at_least: bool) -> Figure | Missing:
-    """The figure at a dotted path, of several the worst. A mapping with q90, low and high is a quantile with
-    its band."""
+    """Returns the figure at a dotted path, or the worst of several. A mapping with q90, low and high is a
+    quantile with its band."""
     values = [value for value in map(_as_figure, _leaves(figures, path.split("."))) if value is not None]
     if not values:
         keys = f"Its keys stand in datasets/{path.split('.')[0]}/figures.json"
@@ -163,11 +163,11 @@ def judge(
     read: Callable[[], Reading],
     decides: Callable[[Question, Figure, Mapping[str, Any]], str] | None = None,
 ) -> Rule:
-    """The rule of a row with the figure that `read` gives, or with the gap by which it raises Absent.
+    """Returns the rule of a row with the figure from `read`, or with the gap if `read` raises Absent.
 
-    Words for the sentences come with the figure; of these `limit` replaces the question's, `case` names the
-    sentence of several, and `text`, `allowed`, `reason`, `fails`, `remedy` replace what the row says.
-    `decides` says what would decide a rule that is undecided.
+    `read` also returns words for the sentences. `limit` replaces the question's limit; `case` selects one of
+    several sentences; `text`, `allowed`, `reason`, `fails`, `remedy` replace those of the row. `decides`
+    returns what would decide an undecided rule.
     """
     try:
         figure, words = read()
@@ -217,8 +217,8 @@ def ask(
     decides: Callable[[Question, Figure, Mapping[str, Any]], str] | None = None,
     row: Row | None = None,
 ) -> Rule:
-    """The rule `key` of a loop for a controller: its figure is that of the function `own`, else the one at
-    its path. `row` stands in the place of the one of rules.toml."""
+    """Returns the rule `key` of a loop for a controller. Its figure comes from the function `own`, or else
+    from its path. `row` replaces the row of rules.toml."""
     row = row or rows(loop)[key]
     question = row.question(key, row.limit(evidence.rules))
 

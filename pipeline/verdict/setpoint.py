@@ -1,4 +1,5 @@
-"""Scoreboard and classifier's figures -> who sets flow and temperature, and whether it may steer."""
+"""Makes the verdict on the setpoint loop from the scoreboard and the classifier's figures: which controller
+sets flow and temperature, and whether it may steer."""
 
 import math
 import re
@@ -65,9 +66,10 @@ NO_CLOG = Missing("not applicable", "nothing happens in this case")
 
 class Cell(NamedTuple):
     """One controller in one case: shares of runs in percent with their 95 % intervals, or why one is missing.
-    Then steps until inside for good; overshoot and flow error in percent; beyond, of good starts those that
-    leave them by each of BEYOND points; back, within +-15 % after a clog, and decisions until 95 % of the
-    runs are inside again. n_eff: as many runs that share nothing as a share is worth, by its name."""
+    `median`, `p90`: steps until a run is inside for good; `overshoot`, `flow_error`: percent; `beyond`:
+    shares of runs from good starts with a flow off by more than each of BEYOND points; `back`: share within
+    +-15 % after a clog; `recovery_p95`: decisions until 95 % of the runs are inside again; `n_eff`: number of
+    independent runs that a share is worth, by the share's name."""
 
     runs: int
     counts: bool
@@ -91,8 +93,9 @@ Case = tuple[str, str]  # simulator, case
 
 
 class Board(NamedTuple):
-    """Who was judged, the best worst case first, with the kind of each; cases in the table's order; who runs
-    by default ("" where nobody chose); who may not, and why. Those who may not stand behind the others."""
+    """The controllers that were judged, the best worst case first, with the kind of each; the cases in the
+    table's order; the default controller ("" if none was chosen); the refused controllers, and why. Refused
+    ones come after the others."""
 
     names: list[str]
     kinds: Mapping[str, str]
@@ -102,18 +105,19 @@ class Board(NamedTuple):
     refused: Mapping[str, str]
 
     def counting(self, name: str) -> list[tuple[Case, Cell]]:
-        """The cases that count for the choice."""
+        """Returns the cases that count for the choice."""
         return [(case, cell) for case in self.cases if (cell := self.cells.get((name, case))) and cell.counts]
 
     def baseline(self) -> str:
-        """The controller of the second column: the default unless it learned from data, else the model-based
-        one; "" where it was not judged."""
+        """Returns the controller of the second column: the default unless it learned from data, otherwise the
+        model-based one; "" if it was not judged."""
         if self.default and self.kinds[self.default] != DATA_DRIVEN:
             return self.default
         return self._judged(MODEL_BASED)
 
     def learned(self) -> str:
-        """The data-driven one that competes: the default where it is one."""
+        """Returns the data-driven controller that competes: the default if it is data-driven, otherwise the
+        best one."""
         mine = self.default and self.kinds[self.default] == DATA_DRIVEN
         return self.default if mine else self._judged(DATA_DRIVEN)
 
@@ -122,12 +126,14 @@ class Board(NamedTuple):
 
 
 def role(board: Board, name: str) -> str:
-    """The mark of a controller by its kind: circle data-driven, square model-based, ring the baselines."""
+    """Returns the controller's mark by its kind: circle for data-driven, square for model-based, ring for
+    baselines."""
     return {DATA_DRIVEN: "data_driven", MODEL_BASED: "model_based"}.get(board.kinds[name], "baseline")
 
 
 def case_text(case: Case, *, whole: bool = False) -> str:
-    """ "accuracy 0.7, clog" -> "accuracy 70 %, clog"; `whole`: after the simulator's name."""
+    """Returns the case in words: "accuracy 0.7, clog" -> "accuracy 70 %, clog"; `whole`: with the simulator's
+    name before it."""
     simulator, name = case
     name = re.sub(rf"^{re.escape(simulator)}[, ]*", "", name) or "as it is"
     name = re.sub(r"accuracy (\d\.?\d*)", lambda match: f"accuracy {100 * float(match[1]):g}{THIN}%", name)
@@ -135,14 +141,15 @@ def case_text(case: Case, *, whole: bool = False) -> str:
 
 
 def within(case: Case) -> str:
-    """The same in the middle of a sentence."""
+    """Returns the case in words, for the middle of a sentence."""
     text = case_text(case, whole=True)
     return text[:1].lower() + text[1:]
 
 
 @or_gap
 def board(evidence: Evidence, subject: str = "") -> Board | Missing:
-    """Everybody who was judged; the default is the one of the choice, or the `subject` of a verdict."""
+    """Returns the board of all controllers that were judged. The default is the chosen one, or the `subject`
+    of a verdict."""
     table, said = need(evidence.tables["scoreboard"]), known(evidence.tables["choice"], {})
     if not len(table["controller"]):
         remedy = "Run ./run dvc repro evaluate_setpoint"
@@ -158,7 +165,7 @@ def board(evidence: Evidence, subject: str = "") -> Board | Missing:
 
 
 def _cell(row: Any) -> Cell:
-    """A row of the scoreboard."""
+    """Returns the cell of a row of the scoreboard."""
     return Cell(
         row.runs,
         row.counts,
@@ -187,8 +194,8 @@ def _figure(value: float, low: float, high: float) -> Figure | Missing:
 
 
 def lasting(cell: Cell) -> Figure | Missing:
-    """The share by which a case is read: settled and staying, or
-    settled where runs end before that can be told."""
+    """Returns the share by which a case is judged: runs that reach and keep the target, or only reach it if
+    runs end too early to tell."""
     return cell.stay if isinstance(cell.stay, Figure) else cell.settled
 
 
@@ -198,7 +205,7 @@ def _rank(board: Board, name: str) -> tuple[float, float]:
 
 
 def worst(board: Board, name: str, what: str) -> tuple[Figure | Missing, Case | None]:
-    """The smallest share `what` (settled, stay, lasting) of the cases that count, and where."""
+    """Returns the smallest share `what` (settled, stay, lasting) of the cases that count, and its case."""
     shares = [
         (figure, case)
         for case, cell in board.counting(name)
@@ -221,7 +228,7 @@ Pair = tuple[Rule, Rule]
 
 
 def of_classifier(rule: Rule) -> bool:
-    """Whether the rule is asked of the classifier, on which every controller rests."""
+    """Returns whether the rule is about the classifier, which every controller needs."""
     return any("see" in row.needed_for for row in rows(LOOP).values() if row.name == rule.name)
 
 
@@ -241,7 +248,7 @@ def _rule(evidence: Evidence, board: Board | None, key: str, name: str, column: 
 
 
 class Harm(NamedTuple):
-    """Of the runs of one controller from good starts those that leave +-25 %, and how many may, in percent;
+    """The share of one controller's runs from good starts that leave +-25 %, and its limit, both in percent;
     its state, and the case."""
 
     figure: Figure
@@ -251,7 +258,8 @@ class Harm(NamedTuple):
 
 
 def bars(evidence: Evidence, board: Board) -> dict[Case, float]:
-    """Percent of runs that may leave +-25 % from good starts, by case; {} where nobody declared it."""
+    """Returns the percentage of runs from good starts that may leave +-25 %, by case; {} if it was not
+    declared."""
     most = evidence.params.get("evaluate_setpoint", {}).get("most_harmed") or {}
     perfect, in_band = most.get("perfect_percent"), most.get("in_band_percent")
     if perfect is None or in_band is None:
@@ -262,7 +270,8 @@ def bars(evidence: Evidence, board: Board) -> dict[Case, float]:
 
 
 def harm_of(board: Board, name: str, limits: Mapping[Case, float]) -> Harm | Missing:
-    """The barred case that decides: of the gravest state the one that is most beyond its bar."""
+    """Returns the case with a limit that decides: of those in the gravest state, the one furthest beyond its
+    limit."""
     found = []
     for case, limit in limits.items():
         cell = board.cells.get((name, case))
@@ -278,7 +287,7 @@ def harm_of(board: Board, name: str, limits: Mapping[Case, float]) -> Harm | Mis
 
 
 def _share(what: str) -> Callable[[Evidence, Board | None, str], Reading]:
-    """The reading of the smallest share `what` of the cases that count."""
+    """Returns a function that reads the smallest share `what` of the cases that count."""
 
     def read(evidence: Evidence, board: Board | None, name: str) -> Reading:
         if board is None:
@@ -299,9 +308,9 @@ MAY_BE_LOST, LEAST_RUNS = 5.7, 190.0
 
 
 def threshold(figure: Figure, n_eff: float, limit: float, *, at_least: bool) -> tuple[Figure, dict[str, Any]]:
-    """The figure as a rule reads it, and words: one threshold on the estimate, which is the limit itself.
-    Decided if it is worth enough runs, else open to both sides: 97 % takes 190 runs, harm of at most 1 % 570.
-    """
+    """Returns the figure for a rule, and words. The estimate itself is compared with the limit if it is worth
+    enough independent runs. Otherwise its band is 0 to 100 and the rule is undecided. A limit of 97 % needs
+    190 runs, harm of at most 1 % needs 570."""
     lost = 100 - limit if at_least else limit
     needed = max(LEAST_RUNS, 100 * MAY_BE_LOST / lost) if lost else math.inf
     words = {"text": share_text(figure), "limit": limit, "n_eff": n_eff, "needed": needed}
@@ -309,12 +318,12 @@ def threshold(figure: Figure, n_eff: float, limit: float, *, at_least: bool) -> 
 
 
 def _segments(evidence: Evidence) -> float:
-    """How many recorded segments the controllers were judged on."""
+    """Returns the number of recorded segments on which the controllers were judged."""
     return float(known(lookup(evidence.tables["choice"], "pair.segments"), math.nan))
 
 
 def _harm(evidence: Evidence, board: Board | None, name: str) -> Reading:
-    """How often a print that was good is spoilt, beside what doing nothing spoils."""
+    """Returns the reading of how often a good print is spoilt, with the same figure for no control."""
     limits = bars(evidence, board) if board else {}
     absent = {
         "reason": "Nothing was judged from good starts.",
@@ -339,12 +348,12 @@ def _harm(evidence: Evidence, board: Board | None, name: str) -> Reading:
 
 
 def _seen(figure: Figure | Missing, text: str = "") -> Reading:
-    """The reading of a share of frames or windows."""
+    """Returns the reading of a share of frames or windows."""
     return figure, {"text": text or share_text(figure)}
 
 
 def share_in(row: Mapping[str, Any] | None) -> Figure | None:
-    """A share with its interval as train_classifier.json gives it; None where it counts no window."""
+    """Returns a share with its interval from train_classifier.json; None if no window was counted."""
     ends = [None if row is None else row.get(key) for key in ("percent", "low", "high")]
     if any(end is None for end in ends):
         return None
@@ -354,8 +363,8 @@ def share_in(row: Mapping[str, Any] | None) -> Figure | None:
 
 @instead(lambda gap: _seen(gap))
 def _right_by_flow(evidence: Evidence, column: int) -> Reading:
-    """The share of windows classified correctly if every flow from 70 to 150 % were as frequent. Yardsticks
-    are not judged by it."""
+    """Returns the reading of the share of windows that would be classified correctly if every flow from 70 to
+    150 % were equally frequent. References are not judged by it."""
     if column:
         return _seen(
             Missing("not applicable", "the yardsticks are judged on windows of all flows"), "not judged so"
@@ -365,7 +374,8 @@ def _right_by_flow(evidence: Evidence, column: int) -> Reading:
 
 
 def _accuracy(evidence: Evidence, column: int) -> Reading:
-    """The classifier's accuracy, beside the best of its yardsticks."""
+    """Returns the reading of the classifier's accuracy or, in the second column, of the best of its
+    references."""
     classifier = evidence.figures["train_classifier"]
     if not column:
         return _seen(accuracy(classifier, "image"))
@@ -379,14 +389,15 @@ def _accuracy(evidence: Evidence, column: int) -> Reading:
 
 @or_gap
 def accuracy(metrics: Mapping | Missing, name: str) -> Figure | Missing:
-    """In percent, with the interval where the stage gives one."""
+    """Returns the accuracy in percent, with its interval if the stage gives one."""
     percent = 100 * need_figure(metrics, f"{name}_accuracy")
     low, high = known(lookup(metrics, f"intervals_percent.{name}"), (percent, percent))
     return Figure(percent, float(low), float(high))
 
 
 def _calibration(*keys: str) -> Callable[[Evidence, int], Reading]:
-    """The reading of the error of calibration: of the classifier, and without its calibration."""
+    """Returns a function that reads the calibration error: of the classifier or, in the second column,
+    without its calibration."""
 
     @instead(lambda gap: (gap._replace(state=OPEN), {"reason": "It was not measured."}))
     def read(evidence: Evidence, column: int) -> Reading:
@@ -406,8 +417,8 @@ SEEING = {
 
 
 def undecided(question: Question, figure: Figure, words: Mapping[str, Any]) -> str:
-    """What would tell: of a share of runs how many more segments; of a share of frames or windows, whose
-    interval straddles the limit, how many times as many."""
+    """Returns what would decide an undecided rule: for a share of runs, how many more segments; for a share
+    of frames or windows with an interval across the limit, how many times as many."""
     if state(question, figure) != UNDECIDED:
         return ""
     if "n_eff" in words:
@@ -435,8 +446,8 @@ BRIEF = {"svc": "SVC", "width": "width"}
 
 
 def verdict(evidence: Evidence) -> Verdict:
-    """Who sets flow and temperature by default: `winner`, "" if nobody chose. `note` says of what printers
-    anything is claimed."""
+    """Returns the verdict on who sets flow and temperature by default. `winner`: that controller, "" if none
+    was chosen; `note`: for which printers the claim holds."""
     scores, recorded = board(evidence), evidence.recorded("train_classifier")
     claim, words = CLAIM_RECORDED if recorded else CLAIM, words_for(recorded=recorded, quick=evidence.quick)
     if isinstance(scores, Missing) or not scores.default:
@@ -492,8 +503,8 @@ def verdict(evidence: Evidence) -> Verdict:
 
 
 def _certified(evidence: Evidence, board: Board) -> Board:
-    """The board with its default; if the certificate of that one is refused, with the next that passes and is
-    not refused, if there is one."""
+    """Returns the board with its default. If the default's certificate is refused, the next controller that
+    passes and is not refused becomes the default, if there is one."""
     if not evidence.refusal(LOOP, board.default):
         return board
     names = [name for name in board.names if name not in board.refused and not evidence.refusal(LOOP, name)]
@@ -507,20 +518,20 @@ def _certified(evidence: Evidence, board: Board) -> Board:
 
 
 def _asked(lines: Sequence[Pair], board: Board) -> list[Rule]:
-    """The rules of the default: those of the classifier, and those of its column."""
+    """Returns the rules for the default: those of the classifier, and those of its column."""
     column = int(board.kinds[board.default] != DATA_DRIVEN)
     return [line[0 if of_classifier(line[0]) else column] for line in lines]
 
 
 def _binding(rule: Rule) -> bool:
-    """Whether the loop cannot steer without the rule."""
+    """Returns whether the loop cannot steer unless the rule passes."""
     row = next((row for row in rows(LOOP).values() if row.name == rule.name), None)
     return row is None or bool(row.needed_for)
 
 
 def _conditions(asked: Sequence[Rule], rendered: bool) -> str:
-    """What would have to come out before the loop may steer: every rule that
-    does not pass with its figure, and what to try."""
+    """Returns what is missing before the loop may steer: every rule that does not pass, with its figure and
+    what to try."""
     short = [rule for rule in asked if rule.state != PASSED]
     figures = [
         f"{rule.name[:1].lower()}{rule.name[1:]} {rule.limit} (now "
@@ -533,7 +544,8 @@ def _conditions(asked: Sequence[Rule], rendered: bool) -> str:
 
 
 def _closest(name: str, rule: Rule) -> str:
-    """Who comes closest, and how far it is off; a rule of the classifier holds whoever controls."""
+    """Returns who comes closest, and how far it is off. A rule of the classifier is the same for all
+    controllers."""
     return (
         f"{rule.reason} By runs that settle and stay {name} comes closest."
         if of_classifier(rule)
@@ -542,14 +554,15 @@ def _closest(name: str, rule: Rule) -> str:
 
 
 def named(board: Board, name: str) -> str:
-    """ "the model-based “Bayes filter”", "the baseline “do nothing”"."""
+    """Returns the kind and the name: "the model-based controller “Bayes filter”", "the baseline “do
+    nothing”"."""
     return f"the {board.kinds[name]}{'' if board.kinds[name] == BASELINE else ' controller'} “{name}”"
 
 
 @instead(lambda gap: PairSentence("Model-based against data-driven: not measured.", None))
 def pair_sentence(choice: Any) -> PairSentence:
-    """ "the Bayes filter keeps 41 points more of its runs than the paper's agent", on the same windows and
-    segments; or that more segments are needed to tell."""
+    """Returns the comparison in words, on the same segments: the winner brings so many points more of its
+    runs to the target and keeps them there than the other; or that more segments are needed."""
     head, pair = "Model-based against data-driven:", need_figure(choice, "pair")
     gap = need_figure(pair, "difference")
     a, b, winner = str(pair["a"]), str(pair["b"]), pair.get("winner")
@@ -578,7 +591,7 @@ def _the(name: str) -> str:
 
 
 def summary(evidence: Evidence, board: Board) -> str:
-    """The default's worst case."""
+    """Returns a sentence on the default's worst case."""
     mine, place = worst(board, board.default, "lasting")
     if place is None or not isinstance(mine, Figure):
         return ""

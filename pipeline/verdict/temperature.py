@@ -1,5 +1,5 @@
-"""Figures of the stages -> the figures of each controller of the temperature loop that its rules ask for: as
-deployed, over all plants, at the 90 % quantile with the band of that quantile."""
+"""Finds, in the figures of the stages, the figures of each controller of the temperature loop that its rules
+need: as deployed, over all plants, at the 90 % quantile with the band of that quantile."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -31,14 +31,14 @@ QUANTILES = (
 
 
 def comparison(figures: Figures) -> Mapping[str, Any]:
-    """The figures of the comparison with what the limits make of them, which the stage `verdict` keeps; {}
-    where there are none."""
+    """Returns the figures of the comparison, with those that the stage `verdict` computes from the limits; {}
+    if there are none."""
     compared, judged = figures.get("evaluate_temperature"), entry(figures.get("verdict"), "comparison")
     return {**compared, **(judged or {})} if isinstance(compared, Mapping) else {}
 
 
 def names(figures: Figures) -> list[str]:
-    """Controllers with figures, in the declared order of simplicity, the yardstick last."""
+    """Returns the controllers with figures, in the declared order of simplicity, the reference last."""
     compared = comparison(figures)
     listed = list(entry(compared, "contestants") or {})
     ordered = [name for name in entry(compared, "order") or BY_NAME if name in listed]
@@ -46,7 +46,7 @@ def names(figures: Figures) -> list[str]:
 
 
 def refused(figures: Figures) -> dict[str, str]:
-    """Why controllers could not take part, by name."""
+    """Returns why controllers could not take part, by name."""
     judged, learned = (
         entry(comparison(figures), "refused"),
         entry(figures.get("learn_kernel"), "undetermined"),
@@ -57,13 +57,13 @@ def refused(figures: Figures) -> dict[str, str]:
 
 
 def finite(value: Any) -> float:
-    """A number of the metrics; null, and what is no number, is without end."""
+    """Returns a number of the metrics. null, and anything that is not a number, gives infinity."""
     numeric = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if numeric and math.isfinite(value) else math.inf
 
 
 def quantile(figures: Any) -> Figure | None:
-    """The 90 % quantile with its band; None where the figure is not there."""
+    """Returns the 90 % quantile with its band; None if the figure does not exist."""
     if not isinstance(figures, Mapping) or "q90" not in figures:
         return None
     value = finite(figures["q90"])
@@ -72,7 +72,8 @@ def quantile(figures: Any) -> Figure | None:
 
 
 def of_controller(figures: Figures, name: str, undeclared: Sequence[str] = ()) -> dict[str, Figure | Missing]:
-    """{key: figure} of one controller; `undeclared` are outputs without low and high."""
+    """Returns {key: figure} of one controller. `undeclared`: outputs without low and high. Raises ValueError
+    if a row of rules.toml has the key of a figure of the page."""
     own = entry(comparison(figures), "contestants", name)
     by_path = {key: row for key, row in rows(LOOP).items() if "." in row.figure}
     if taken := [
@@ -99,7 +100,7 @@ def of_controller(figures: Figures, name: str, undeclared: Sequence[str] = ()) -
 
 
 def _without(figures: Figures, name: str) -> Missing:
-    """Why a controller has no figures: refused, or nothing was measured."""
+    """Returns why a controller has no figures: it was refused, or nothing was measured."""
     compared = figures.get("evaluate_temperature")
     if reason := refused(figures).get(name):
         return Missing("failed", reason)
@@ -107,14 +108,15 @@ def _without(figures: Figures, name: str) -> Missing:
 
 
 def unstable(figures: Any) -> tuple[int, int]:
-    """(plants that a controller does not hold stable, plants)."""
+    """Returns (number of plants that the controller does not keep stable, number of plants)."""
     stable, of = (entry(figures, "stable", key) for key in ("count", "of"))
     return (of - stable, of) if isinstance(stable, int) and isinstance(of, int) else (0, 0)
 
 
 def _margin(figures: Any, key: str) -> Figure | None:
-    """A margin of the plant that a tenth of all plants lie below; none where a plant's loop is unstable. The
-    panel's spread has gain, speed and delay in it: the worst plant would ask for the same doubt twice."""
+    """Returns the margin below which a tenth of all plants lie; 0 if the loop of any plant is unstable, None
+    if it was not measured. The worst plant is not used: the spread of the test set already includes gain,
+    speed and delay, so the same uncertainty would count twice."""
     margin = entry(figures, "margins", key)
     if not isinstance(margin, Mapping) or "q10" not in margin:
         return None
@@ -122,14 +124,14 @@ def _margin(figures: Any, key: str) -> Figure | None:
 
 
 def _without_margin(figures: Mapping[str, Any], gap: Missing) -> Missing:
-    """A controller that closes no loop has no margin to lose."""
+    """Returns the reason why there is no margin. A controller that closes no loop has no margin to lose."""
     if "margins" in figures and figures["margins"] is None:
         return Missing("not applicable", "it closes no loop")
     return gap
 
 
 def crossings(figures: Any, undeclared: Sequence[str] = ()) -> Figure | Missing:
-    """Cases in which a true output leaves its declared low or high."""
+    """Returns the number of cases in which a true output leaves its declared low or high."""
     if undeclared:
         names = ", ".join(undeclared)
         return Missing(
@@ -144,7 +146,7 @@ def crossings(figures: Any, undeclared: Sequence[str] = ()) -> Figure | Missing:
 
 
 def false_stops(figures: Any) -> Figure | Missing:
-    """Cases on healthy machines in which the supervisor leaves the law."""
+    """Returns the number of cases on healthy machines in which the supervisor stops using the controller."""
     found = entry(figures, "supervised")
     if isinstance(figures, Mapping) and "supervised" in figures and found is None:
         return Missing("not applicable", "it has no supervisor")
@@ -158,10 +160,11 @@ def false_stops(figures: Any) -> Figure | Missing:
 
 
 def data(figures: Figures, name: str) -> Figure | Missing:
-    """Samples of the record over those that a controller needs. So many are needed that what its estimator
-    leaves open costs no more in closed loop than `learn_kernel.allowed_gap_percent` of the quadratic cost, or
-    ALLOWED_PERCENT of the engineering cost; extra cost falls as one over the samples. Undecided if the
-    identified plant is none to judge by."""
+    """Returns the samples of the record divided by those that a controller needs. The needed samples are
+    those at which its estimator's uncertainty costs no more in closed loop than
+    `learn_kernel.allowed_gap_percent` of the quadratic cost, or ALLOWED_PERCENT of the engineering cost. The
+    extra cost falls as one over the samples. Undecided if the identified plant is not good enough to judge
+    by."""
     learned, compared = figures.get("learn_kernel"), figures.get("evaluate_temperature")
     learned_from = BY_NAME[name].learned_from if name in BY_NAME else "plant"
     allowed = entry(learned, "allowed_gap_percent")
@@ -188,15 +191,15 @@ def data(figures: Figures, name: str) -> Figure | Missing:
 
 
 def _for_gap(samples: Any, excess: Any, allowed: Any) -> int | None:
-    """Samples at which an extra cost in percent falls to what is allowed."""
+    """Returns the number of samples at which an extra cost in percent falls to the allowed one."""
     if samples is None or excess is None or not allowed:
         return None
     return max(math.ceil(samples * excess / allowed), 1)
 
 
 def _no_plant(model: Any) -> Missing | None:
-    """Why an identified plant is none to judge a record by: it predicts too little, or a heater cools in it.
-    Its bands are about a wrong plant then, and their width says nothing."""
+    """Returns why an identified plant cannot be used to judge a record: its predictions are too poor, or a
+    heater cools in it. Its bands then describe a wrong plant, and their width says nothing."""
     least = rows("identification")["ahead"].at_least
     ends = entry(model, "fit_holdout_ahead_band") or {}
     poor = [output for output, (_, high) in ends.items() if high < least]

@@ -1,5 +1,5 @@
-"""What the verdicts of all loops stand on: a figure, the rule that it is held against, which rule decides,
-and the verdict. No page, no file."""
+"""What the verdicts of all loops are made of: a figure, the rule that limits it, the choice of the rule that
+decides, and the verdict. It reads no page. Its only files are those of the stage `verdict`."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,9 +16,8 @@ CERTIFICATE = "certificate"
 
 
 class Figure(NamedTuple):
-    """A median and its 90 % band; infinite where a run never settles, or no delay breaks a loop. `runs` are
-    the repetitions behind them, where they are known.
-    """
+    """A median and its 90 % band; infinite if a run never settles, or no delay makes a loop unstable. `runs`:
+    the repetitions behind them, if known."""
 
     value: float
     low: float
@@ -28,8 +27,8 @@ class Figure(NamedTuple):
 
 
 class Missing(NamedTuple):
-    """In the place of a figure: its state (not measured, failed, not
-    applicable, stale), why, and what to do."""
+    """Takes the place of a figure: its state (not measured, failed, not applicable, stale), why, and what to
+    do."""
 
     state: str
     reason: str
@@ -45,9 +44,8 @@ def _ended(text: str) -> str:
 
 
 class Question(NamedTuple):
-    """One row of page one: the answer's number, the figure's key, what is asked, its unit, its limit, and
-    which of the five rules it belongs to.
-    """
+    """One row of page one: the answer's number, the figure's key, its title, unit and limit, and the rule
+    that it belongs to."""
 
     answer: int
     key: str
@@ -63,8 +61,8 @@ Answers = Mapping[str, Figure | Missing]
 
 
 def state(question: Question, figure: Figure | Missing) -> str:
-    """Passed: the whole band is inside the limit; failed: the whole
-    band is outside; undecided: it straddles."""
+    """Returns passed if the whole band is inside the limit, failed if the whole band is outside, undecided if
+    the limit lies within the band. A Missing is failed or not measured."""
     if isinstance(figure, Missing):
         return FAILED if figure.state == FAILED else OPEN
     best, worst = (figure.high, figure.low) if question.at_least else (figure.low, figure.high)
@@ -73,8 +71,8 @@ def state(question: Question, figure: Figure | Missing) -> str:
 
 
 def share(question: Question, value: float) -> float:
-    """Share of the allowance used: value / limit, or required / actual where more is better. Of what must not
-    happen at all, none or all of it."""
+    """Returns the share of the allowance that is used: value / limit, or required / actual if more is better.
+    If the limit is 0: 0 or infinite."""
     if not question.limit:
         return math.inf if value > 0 else 0.0
     if question.at_least:
@@ -86,16 +84,16 @@ def share(question: Question, value: float) -> float:
 
 
 def count_of(number: float) -> Figure:
-    """A figure that was counted or computed once: its band is itself."""
+    """Returns a figure that was counted or computed once. Its band is the value itself."""
     return Figure(number, number, number)
 
 
 class Rule(NamedTuple):
-    """One rule held against one controller: what is asked, and the figure with its band.
+    """One rule applied to one controller: the question, and the figure with its band.
 
-    `text` and `limit` say both as the page does. `place` is the id of the picture behind it. `reason` says in
-    a sentence why the rule does not pass, `remedy` what to do then. A rule that asks no question, such as
-    drift, has the state of what is missing, and passes where nothing is.
+    `text` and `limit` are figure and limit as the page shows them; `place`: id of the picture that shows it;
+    `reason`: a sentence on why the rule does not pass; `remedy`: what to do then. A rule without a question,
+    such as drift, has the state of its Missing, and passes if nothing is missing.
     """
 
     name: str
@@ -109,7 +107,7 @@ class Rule(NamedTuple):
 
     @property
     def state(self) -> str:
-        """Passed, failed, undecided (the band straddles the limit) or not measured."""
+        """Passed, failed, undecided (the limit lies within the band) or not measured."""
         if self.question is None:
             return self.figure.state if isinstance(self.figure, Missing) else PASSED
         return state(self.question, self.figure)
@@ -121,18 +119,19 @@ FAILED_FIRST = ((FAILED,), (UNDECIDED, OPEN))
 
 
 def deciding(rules: Iterable[Rule], order: Sequence[Sequence[str]] = BY_SEVERITY) -> Rule | None:
-    """The rule that decides: the first in the gravest state; None where none failed or is open."""
+    """Returns the rule that decides: the first one in the gravest state; None if no rule failed or is
+    open."""
     rules = list(rules)
     return next((rule for states in order for rule in rules if rule.state in states), None)
 
 
 def worst_state(states: Sequence[str]) -> str:
-    """The gravest of these states: failed, undecided, not measured, passed."""
+    """Returns the gravest of these states: failed, undecided, not measured, passed."""
     return next((wanted for group in BY_SEVERITY for wanted in group if wanted in states), PASSED)
 
 
 def overall(states: Sequence[str]) -> str:
-    """What a verdict says of rules in these states: failed, open or passed."""
+    """Returns the state of a verdict with rules in these states: failed, open or passed."""
     return {FAILED: FAILED, PASSED: PASSED}.get(worst_state(states), OPEN)
 
 
@@ -140,14 +139,14 @@ def overall(states: Sequence[str]) -> str:
 
 
 class Words(NamedTuple):
-    """What a verdict may say. A verdict on simulated machines says that it is one."""
+    """The wording of a verdict. A verdict on simulated machines says that it is one."""
 
     passed: str
     failed: str
     undecided: str
 
     def of(self, state: str) -> str:
-        """The word for a verdict in this state, `passed` with a place for the controller."""
+        """Returns the words for a verdict in this state. `passed` has a placeholder for the controller."""
         return {PASSED: self.passed, FAILED: self.failed}.get(state, self.undecided)
 
 
@@ -159,13 +158,14 @@ QUICK = Words("Quick look passed: {}.", "Quick look failed.", "Quick look undeci
 
 
 def words_for(*, recorded: bool, quick: bool) -> Words:
-    """The words of a run on recordings or on simulated machines; a quick look says that it is one."""
+    """Returns the words for a run on recordings or on simulated machines. A quick look says that it is
+    one."""
     return QUICK if quick else TRIAL if recorded else SIMULATION
 
 
 class PairSentence(NamedTuple):
-    """Model-based against data-driven: the answer in words, which is better (None if they are not told
-    apart), the answer in short, and what is said beside it."""
+    """Model-based against data-driven: the answer in words, the better one (None if undecided), the answer in
+    short, and a remark."""
 
     text: str
     winner: str | None
@@ -174,13 +174,13 @@ class PairSentence(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What is decided on one loop, and by which rule.
+    """The decision on one loop, and the rule that decides it.
 
-    `state` is passed, failed or not measured. Decision, lead, reason, remedy and note are whole sentences.
-    `rule` names the rule that decides, "" where all passed. `winner` is the controller that should run.
-    `rules` has a line for each rule, and in it an entry for each controller that is shown. `subject` is the
-    controller that the verdict is about, passed or not; `rehearsal`: it was judged on simulated data.
-    `answer` says which is better, model-based or data-driven, in a sentence, `short_answer` in few words.
+    `state`: passed, failed or not measured. Decision, lead, reason, remedy and note are whole sentences.
+    `rule`: name of the rule that decides, "" if all passed; `winner`: the controller that should run;
+    `rules`: a line for each rule, and in it an entry for each controller shown; `subject`: the controller
+    that the verdict is about, passed or not; `rehearsal`: it was judged on simulated data; `answer`: says
+    which is better, model-based or data-driven, in a sentence; `short_answer`: the same in few words.
     """
 
     loop: str
@@ -200,7 +200,7 @@ class Verdict(NamedTuple):
 
     @property
     def word(self) -> str:
-        """Passed, failed or open: the class of the verdict on a page."""
+        """The class of the verdict on a page: passed, failed or open."""
         return {PASSED: "passed", FAILED: "failed"}.get(self.state, "open")
 
     @property
@@ -209,7 +209,7 @@ class Verdict(NamedTuple):
         return f"{self.decision} {self.lead}".strip()
 
     def metrics(self) -> dict[str, str | bool | None]:
-        """What datasets/report/figures.json keeps of it."""
+        """Returns what datasets/report/figures.json keeps of it."""
         return {name: getattr(self, name) for name in WRITTEN}
 
 
@@ -236,7 +236,8 @@ def write(verdicts: Mapping[str, Verdict], folder: str | Path) -> None:
 
 
 def read(folder: str | Path, names: Sequence[str] = LOOPS) -> dict[str, Verdict]:
-    """The verdicts that `write` wrote, by loop. A loop that is switched off has no file and is left out."""
+    """Returns the verdicts that `write` wrote, by loop. A loop that is switched off has no file and is left
+    out."""
     files = {loop: Path(folder) / f"{loop}.json" for loop in names}
     return {
         loop: _decode(artifacts.read_json(path)) for loop, path in files.items() if artifacts.exists(path)
@@ -244,14 +245,14 @@ def read(folder: str | Path, names: Sequence[str] = LOOPS) -> dict[str, Verdict]
 
 
 def read_certificates(folder: str | Path) -> dict[str, dict[str, dict[str, Any]]]:
-    """{loop: {controller: {"passed", "why"}}} by the limits of the run, which the stage wrote beside the
-    verdicts; {} if it has not run."""
+    """Returns {loop: {controller: {"passed", "why"}}} by the limits of the run, as the stage wrote it in the
+    folder of the verdicts; {} if it has not run."""
     path = Path(folder) / CERTIFICATES
     return artifacts.read_json(path) if artifacts.exists(path) else {}
 
 
 def _encode(rule: Rule) -> dict[str, Any]:
-    """A rule for JSON, which knows no infinity: a number that is not finite is text."""
+    """Returns a rule for JSON. JSON has no infinity, so a number that is not finite is text."""
     figure, question = rule.figure, rule.question
     return rule._asdict() | {
         "figure": {name: _text(value) for name, value in figure._asdict().items()},

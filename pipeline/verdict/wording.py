@@ -1,4 +1,5 @@
-"""Figures of the temperature loop in sentences: with their unit, or in words if their digits say nothing."""
+"""Puts figures of the temperature loop into sentences: with their unit, or in words if their digits say
+nothing."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,8 +17,9 @@ MOST_PLACES = 6
 
 
 def places_of(question: Question, figures: Sequence[Figure | Missing]) -> int:
-    """Decimals of a row: what its narrowest band supports, two unless a figure has less than two digits then,
-    and as many as tell apart any two figures whose bands do not meet."""
+    """Returns the decimals of a row: those that its narrowest band supports, but at most two unless a figure
+    would then have less than two digits. More are used until any two figures with separate bands look
+    different."""
     known = [f for f in figures if isinstance(f, Figure) and not _out_of_words(f.value, question.unit)]
     if question.key == "data":
         return 0 if all(f.value >= 10 for f in known) else 2
@@ -39,7 +41,7 @@ def _out_of_words(value: float, unit: str) -> bool:
 
 
 def worded(question: Question, value: float, places: int) -> str:
-    """A figure with its unit; in words where its digits say nothing."""
+    """Returns a figure with its unit, or in words if its digits say nothing."""
     if math.isinf(value):
         return INFINITE.get(question.key, "unstable")
     if _out_of_words(value, question.unit):
@@ -48,7 +50,7 @@ def worded(question: Question, value: float, places: int) -> str:
 
 
 def banded(question: Question, figure: Figure, places: int) -> str:
-    """The band of a figure, "" where it is none or one of its ends says nothing."""
+    """Returns the band of a figure, "" if it has none or if one of its ends says nothing."""
     ends = worded(question, figure.low, places), worded(question, figure.high, places)
     if OFF_THE_SCALE in ends or any(map(math.isinf, (figure.low, figure.high))):
         return "" if ends[0] == ends[1] else " to ".join(ends).replace("never settles", "never")
@@ -56,8 +58,8 @@ def banded(question: Question, figure: Figure, places: int) -> str:
 
 
 def limit_text(question: Question) -> str:
-    """ "≤ 0.5 °C", as it was declared: "10.000 %" reads as ten thousand where a point parts thousands; "" if
-    there is none."""
+    """Returns "≤ 0.5 °C", with the decimals that were declared: "10.000 %" could be read as ten thousand. ""
+    if there is no limit."""
     if math.isinf(question.limit):
         return ""
     sign = "≥" if question.at_least else "≤"
@@ -73,8 +75,8 @@ LOST = "{who} {lost} at the 90 % quantile of all cases; the rule allows {limit}.
 
 
 def words_of(question: Question, figure: Figure, name: str) -> dict[str, Any]:
-    """What the sentence of a rule says of a controller: who, its value and the limit; `fails` is the sentence
-    of a figure without digits."""
+    """Returns the words for a rule's sentence on a controller: who, its value and the limit. `fails` is the
+    sentence for a figure without digits."""
     places = places_of(question, [figure])
     value = worded(question, figure.value, places)
     # a limit too small for the figure's decimals has its own
@@ -98,6 +100,6 @@ def words_of(question: Question, figure: Figure, name: str) -> dict[str, Any]:
 
 
 def straddling(question: Question, figure: Figure, words: Mapping[str, Any]) -> str:
-    """That the band of a quantile straddles its limit."""
+    """Returns the sentence that the limit lies within the band of a quantile."""
     ends = banded(question, figure, places_of(question, [figure]))
     return f" The band of that quantile, {ends}, straddles the limit."
