@@ -1,14 +1,15 @@
 """The table of controllers of the deposition loop: laws that learn a command trial by trial, and composers
 that make the command of a part. Each has one row with its name, its heading on pages and its kind.
 
-A name stands in artifacts: column `law` of trials.parquet and lessons.parquet, column `composer` of
-scores.parquet, and `<name>_mm3_per_s` of signals.parquet. It never changes. Nothing guesses a kind from a
+A name is written to artifacts: column `law` of trials.parquet and lessons.parquet, column `composer` of
+scores.parquet, and `<name>_mm3_per_s` of signals.parquet. It never changes. A kind is never guessed from a
 name.
 
 Kinds: a data-driven command was learned trial by trial, on training routines or as a library of their
-signals; a model-based one inverts the identified chain of the extruder; on-off control and pressure advance
-are the baselines. A command that was learned on the very part is the reference: no other composer knows the
-part beforehand."""
+signals. A model-based command inverts the identified chain of the extruder. On-off control and pressure
+advance are the baselines. A command that was learned on the part itself is the reference, because no other
+composer knows the part beforehand.
+"""
 
 from typing import Literal, NamedTuple
 

@@ -1,5 +1,5 @@
-"""The extruder: plunger command -> flow. The nominal first-order model (Hoelzle 2009, eq. 1), the harder
-chain that trials run on, its draws, and the training routine."""
+"""The extruder, from plunger command to flow: the nominal first-order model (Hoelzle 2009, eq. 1), the harder
+chain that trials run on, random extruders of that kind, and the training routine."""
 
 import math
 from collections.abc import Mapping
@@ -44,22 +44,22 @@ class Extruder(NamedTuple):
 
 
 def to_json(extruder: Extruder) -> dict[str, float | None]:
-    """An extruder as JSON: no lag is null."""
+    """Returns an extruder as JSON; no lag is null."""
     return {name: float(value) if np.isfinite(value) else None for name, value in extruder._asdict().items()}
 
 
 def from_json(values: Mapping[str, float | None]) -> Extruder:
-    """What `to_json` made."""
+    """Returns the extruder that `to_json` wrote."""
     return Extruder(**{name: np.inf if value is None else value for name, value in values.items()})
 
 
 class Routine(NamedTuple):
-    """The training routine (Hoelzle 2009, section III): all arrays (T,), one sample each `sample_time_s`.
+    """The training routine (Hoelzle 2009, section III). All arrays are (T,), one sample each `sample_time_s`.
 
-    r is the wanted flow in mm^3/s, speed the gantry's in mm/s, position in mm along the line from where the
-    trial begins. The gantry runs at the printing speed before the start and after the stop too, so that ooze
-    there lies on the line and is seen; it halts in the pause. printing is True where r > 0. The ramps are
-    centred on the events start_s, pause_s = (begin, end) and stop_s. number counts the training routines, the
+    r is the wanted flow in mm^3/s, speed the gantry's in mm/s, position in mm along the line from the start
+    of the trial. The gantry runs at the printing speed before the start and after the stop too, so that ooze
+    there lies on the line and is visible. It halts in the pause. printing is True where r > 0. The ramps are
+    centred on the events start_s, pause_s = (begin, end) and stop_s. number counts the training routines; the
     reference is 0.
     """
 
@@ -75,8 +75,8 @@ class Routine(NamedTuple):
 
     @property
     def plan(self) -> dict[str, float]:
-        """What tells this routine from others: its number, its speed in mm/s, and how long it is off, on,
-        pauses and is off again, in s."""
+        """The values that distinguish this routine from others: its number, its speed in mm/s, and the times
+        in s of off, on, pause and the final off."""
         end_s = len(self.time_s) * float(self.time_s[1])
         off_s, on_s, pause_s, _, tail_s = np.diff(
             [0.0, self.start_s, *self.pause_s, self.stop_s, end_s]
@@ -88,15 +88,15 @@ class Routine(NamedTuple):
 
 
 def ramp(t: np.ndarray, width_s: float) -> np.ndarray:
-    """The unit step at t = 0 after two moving averages of `width_s`: 0
-    before -width, 1 after width, slope 1 / width at 0."""
+    """Returns the unit step at t = 0 after two moving averages of `width_s`: 0 before -width, 1 after width,
+    slope 1 / width at 0."""
     s = np.clip(np.asarray(t, float) / width_s, -1.0, 1.0)
     return np.where(s < 0, (1 + s) ** 2 / 2, 1 - (1 - s) ** 2 / 2)
 
 
 def ramp_of_gantry(t: np.ndarray, width_s: float, gantry_s: float) -> np.ndarray:
-    """`ramp` where the gantry takes gantry_s from rest to its speed, evenly: the mean of `ramp` over that
-    time around t; gantry_s 0 is `ramp` itself."""
+    """Returns `ramp` for a gantry that takes gantry_s from rest to its speed at constant acceleration: the
+    mean of `ramp` over that time around t. If gantry_s is 0, this is `ramp` itself."""
     if gantry_s == 0:
         return ramp(t, width_s)
     early, late = (_ramp_sum(np.asarray(t, float) + half, width_s) for half in (-gantry_s / 2, gantry_s / 2))
@@ -104,7 +104,7 @@ def ramp_of_gantry(t: np.ndarray, width_s: float, gantry_s: float) -> np.ndarray
 
 
 def _ramp_sum(t: np.ndarray, width_s: float) -> np.ndarray:
-    """The integral of `ramp` up to t, in s."""
+    """Returns the integral of `ramp` up to t, in s."""
     s = np.clip(t / width_s, -1.0, 1.0)
     return width_s * np.where(s < 0, (1 + s) ** 3 / 6, s + (1 - s) ** 3 / 6) + np.maximum(t - width_s, 0.0)
 
@@ -121,11 +121,12 @@ def routine(
     gantry_ramp_s: float = 0.0,
     sample_time_s: float,
 ) -> Routine:
-    """Off, on, pause, on, off: r = bead area x speed while printing. `speed` in mm/s; the gantry changes it
-    in gantry_ramp_s, evenly, and two boxes of `ramp_s` shape every change beside.
+    """Returns the routine off, on, pause, on, off, with r = bead area x speed while printing. `speed` in
+    mm/s; the gantry reaches it in gantry_ramp_s at constant acceleration, and two boxes of `ramp_s` shape
+    every change in addition.
 
-    Raises ValueError if a ramp does not fit before the start or after the
-    stop; ramps longer than the pause leave a dip of it.
+    Raises ValueError if a ramp does not fit before the start or after the stop. If the ramps are longer than
+    the pause, only a dip remains of it.
     """
     shortest, before = min(off_s, tail_s), ramp_s + gantry_ramp_s / 2
     if not (0 < ramp_s and 0 <= gantry_ramp_s and before <= shortest):
@@ -148,8 +149,8 @@ def routine(
 
 
 def _lag_ramp(t: np.ndarray, lag_hz: float) -> np.ndarray:
-    """Response of the second-order lag to the unit ramp at times t (s), 0
-    before 0; this is the integral of its step response."""
+    """Returns the response of the second-order lag to the unit ramp at times t (s), 0 before 0. It is the
+    integral of the step response."""
     t = np.maximum(t, 0.0)
     if math.isinf(lag_hz):
         return t
@@ -160,11 +161,11 @@ def _lag_ramp(t: np.ndarray, lag_hz: float) -> np.ndarray:
 
 
 def lag_filter(delay_s: float, lag_hz: float, sample_time_s: float) -> tuple[int, np.ndarray, np.ndarray]:
-    """(whole samples of delay, numerator, denominator) of the delay and the lag, from an input held between
-    samples to the output's mean over the sample.
+    """Returns (whole samples of delay, numerator, denominator) of the delay and the lag, from an input
+    constant between samples to the mean of the output over the sample.
 
-    The pulse response is the second difference of the ramp response at n Ts - delay; its denominator is
-    known, so a few numerators hold all of it.
+    The pulse response is the second difference of the ramp response at n Ts - delay. Its denominator is
+    known, so a few numerator coefficients describe all of it.
     """
     whole, fraction = divmod(delay_s / sample_time_s, 1.0)
     means = np.diff(_lag_ramp((np.arange(5) - fraction) * sample_time_s, lag_hz)) / sample_time_s
@@ -181,8 +182,8 @@ def lag_filter(delay_s: float, lag_hz: float, sample_time_s: float) -> tuple[int
 
 
 def lagged(u: np.ndarray, delay_s: float, lag_hz: float, sample_time_s: float) -> np.ndarray:
-    """u (..., T) held between samples, after the delay and the second-order lag, as its mean from each sample
-    to the next: exact for any delay."""
+    """Returns u (..., T), constant between samples, after the delay and the second-order lag, as its mean
+    from each sample to the next. This is exact for any delay."""
     whole, numerator, denominator = lag_filter(delay_s, lag_hz, sample_time_s)
     late = np.zeros(u.shape)
     late[..., whole:] = u[..., : max(u.shape[-1] - whole, 0)]
@@ -190,13 +191,13 @@ def lagged(u: np.ndarray, delay_s: float, lag_hz: float, sample_time_s: float) -
 
 
 def backlash(x: np.ndarray, play: np.ndarray | float) -> np.ndarray:
-    """Play of full width `play` (...,) along the last axis of x (..., T): the output stays until x leaves it
-    by half the play. y(-1) = 0 and
+    """Returns x (..., T) after play of full width `play` (...,) along the last axis: the output is constant
+    until x differs from it by half the play. y(-1) = 0 and
 
         y(t) = min(max(y(t-1), x(t) - play/2), x(t) + play/2)
 
-    Each step clips y to [x - play/2, x + play/2], and clips compose to clips: blocks of
-    the time axis are walked side by side, then joined.
+    Each step clips y to [x - play/2, x + play/2], and a sequence of clips is again a clip. So blocks of the
+    time axis are computed side by side and then joined.
     """
     if not np.any(play):
         return x
@@ -224,7 +225,7 @@ def backlash(x: np.ndarray, play: np.ndarray | float) -> np.ndarray:
 
 
 def _modes(extruder: Extruder) -> list[tuple[float, float]]:
-    """(share of the gain, time constant) of the parallel first-order modes."""
+    """Returns (share of the gain, time constant) of the parallel first-order modes."""
     c = extruder.creep_share
     return [(1 - c, extruder.time_constant_s)] + ([(c, extruder.creep_time_s)] if c > 0 else [])
 
@@ -232,12 +233,12 @@ def _modes(extruder: Extruder) -> list[tuple[float, float]]:
 def pressed(
     extruder: Extruder, u: np.ndarray, *, sample_time_s: float, drive: Drive = UNLIMITED
 ) -> np.ndarray:
-    """x (..., T) in mm^3/s from rest: the flow that the command u (..., T) in mm would press out if the ink
-    had no yield; below the yield nothing comes.
+    """Returns x (..., T) in mm^3/s from rest: the flow that the command u (..., T) in mm would press out if
+    the ink had no yield. Below the yield nothing comes out.
 
-    u is held between samples, and the drive does what it can of it. Its backlash comes before delay and lag,
-    in series with the extruder's own play. Each block takes the one before it as held at its mean over the
-    sample.
+    u is constant between samples, and the drive follows it within its limits. The drive's backlash comes
+    before delay and lag, in series with the extruder's own play. Each block takes its input as constant at
+    its mean over the sample.
     """
     v = backlash(obeyed(u, drive, sample_time_s=sample_time_s), drive.backlash_mm)
     v = backlash(lagged(v, extruder.delay_s, extruder.lag_hz, sample_time_s), extruder.play)
@@ -249,14 +250,14 @@ def pressed(
 
 
 def flow(extruder: Extruder, u: np.ndarray, *, sample_time_s: float, drive: Drive = UNLIMITED) -> np.ndarray:
-    """True flow y = max(x - yield, 0) (T,) in mm^3/s under the command u (T,) in
-    mm from rest, as the drive follows it; x as in `pressed`."""
+    """Returns the true flow y = max(x - yield, 0) (T,) in mm^3/s for the command u (T,) in mm from rest, as
+    the drive follows it; x as in `pressed`."""
     return np.maximum(pressed(extruder, u, sample_time_s=sample_time_s, drive=drive) - extruder.yield_, 0.0)
 
 
 def frequency_response(extruder: Extruder, frequency_hz: np.ndarray, *, sample_time_s: float) -> np.ndarray:
-    """P(e^(j 2 pi f Ts)) (F,) from samples of u to samples of x: delay, lag and first order, exactly as
-    `pressed` runs them; play and yield left out."""
+    """Returns P(e^(j 2 pi f Ts)) (F,) from samples of u to samples of x: delay, lag and first order, exactly
+    as in `pressed`, without play and yield."""
     z = np.exp(-2j * np.pi * np.asarray(frequency_hz, float) * sample_time_s)
     whole, numerator, denominator = lag_filter(extruder.delay_s, extruder.lag_hz, sample_time_s)
     P = z**whole * np.polyval(numerator[::-1], z) / np.polyval(denominator[::-1], z)
@@ -267,11 +268,13 @@ def frequency_response(extruder: Extruder, frequency_hz: np.ndarray, *, sample_t
 def disturb(
     flow: np.ndarray, rng: np.random.Generator, *, steady_flow: float, white: float, drift: float, gain: float
 ) -> np.ndarray:
-    """Measured flow (T,): what does not repeat from trial to trial laid over
-    the true flow, as shares of `steady_flow` (mm^3/s).
+    """Returns the measured flow (T,): the true flow plus disturbances that do not repeat from trial to trial,
+    as shares of `steady_flow` (mm^3/s).
 
-    (1 + gain w) y + steady_flow (drift walk + white v): w drawn once a trial, v at each sample, and a random
-    walk whose r.m.s. over the trial is `drift`.
+        (1 + gain w) y + steady_flow (drift walk + white v)
+
+    w is drawn once per trial, v at each sample; walk is a random walk, and the r.m.s. of drift walk over the
+    trial is `drift`.
     """
     steps = len(flow)
     walk = np.cumsum(rng.standard_normal(steps)) * math.sqrt(2 / steps)
@@ -287,8 +290,8 @@ def draw(
     steady_flow: float,
     creep_share: float = 0.0,
 ) -> Extruder:
-    """An extruder of the family around nominal gain (mm^3/s per mm) and time constant: each off by 10-30 %,
-    either way, and everything that (1) leaves out."""
+    """Returns a random extruder around nominal gain (mm^3/s per mm) and time constant: each is off by 10-30
+    %, up or down, and it has delay, lag, play and yield, which (1) leaves out; creep as given."""
     off = [1 + rng.choice([-1, 1]) * rng.uniform(*MISMATCH) for _ in range(2)]
     K = float(gain * off[0])
     return Extruder(

@@ -1,5 +1,5 @@
-"""The nearest flow that a drive of limited travel and speed can reach, and the ramp of the gantry from which
-on little is lost to it."""
+"""The nearest flow that a drive of limited travel and speed can reach, and the shortest ramp of the gantry at
+which the drive loses little."""
 
 import functools
 import math
@@ -34,15 +34,16 @@ def nearest(
     piece: int = PIECE,
     margin: int = MARGIN,
 ) -> np.ndarray:
-    """x (N,) from rest that is nearest to `target` (N,) among all with |v(t)| <= bound and |v(t) - v(t-1)| <=
-    step, v(t) = x(t) - pole x(t-1): all that a first-order extruder can press.
+    """Returns x (N,), from rest, that is nearest to `target` (N,) among all with |v(t)| <= bound and |v(t) -
+    v(t-1)| <= step, v(t) = x(t) - pole x(t-1). These are all x that a first-order extruder can press.
 
-    Where `free` (N,) is True only what lies above the target costs (no-flow: below the yield all is well),
-    and below it x settles at `rest` (N,), the target where none is given. x, bound and step in mm^3/s: K (1 -
-    pole) times the amplitude, and times the speed and the sample time.
+    If `free` (N,) is True, only x above the target costs, because no flow is wanted and none comes below the
+    yield; below it x settles at `rest` (N,), or at the target if rest is None. x, bound and step are in
+    mm^3/s: bound is K (1 - pole) times the amplitude, step is K (1 - pole) times the speed and the sample
+    time.
 
-    A long signal is solved piece by piece, each from where the one before ends, so that x keeps the limits
-    across the joins, and with so much of what follows that the piece does not change with more.
+    A long signal is solved piece by piece. Each piece starts where the last one ended, so x keeps the limits
+    across the joins, and looks far enough ahead that looking further would not change it.
     """
     if not (math.isfinite(bound) or math.isfinite(step)):
         return np.array(target, float)
@@ -77,13 +78,14 @@ def ramp_that_loses_little(
     longest_s: float,
     sample_time_s: float,
 ) -> float:
-    """The shortest time in s, 0 or more, in which the gantry speeds up and slows down such that the drive
-    loses at most LOSS on a line; inf where none up to longest_s does.
+    """Returns the shortest time in s, 0 or more, in which the gantry may speed up and slow down so that the
+    drive loses at most LOSS on a line; inf if no time up to longest_s is enough.
 
-    The flow is bead area x speed: it follows the gantry's ramp up to `steady_flow` in mm^3/s and down again,
-    shaped by two boxes of ramp_s. Lost is the r.m.s. error of the nearest flow within amplitude and speed, as
-    share of that of on-off control r / K without limits; the unlimited command has none. The yield is loaded
-    before, over as long as it takes, and costs nothing. Delay, lag and creep are left out. Bisected to 1 %.
+    The flow is bead area x speed. It follows the gantry's ramp up to `steady_flow` in mm^3/s and down again,
+    shaped by two boxes of ramp_s. The loss is the r.m.s. error of the nearest flow within amplitude and
+    speed, as share of that of on-off control r / K without limits; the unlimited command has no loss. The
+    yield is loaded before, over as long as it takes, and costs nothing. Delay, lag and creep are left out.
+    Bisected to 1 %.
     """
     if math.isinf(drive.amplitude_mm) and math.isinf(drive.speed_mm_per_s):
         return 0.0
@@ -116,8 +118,8 @@ def ramp_of_all(
     longest_s: float,
     sample_time_s: float,
 ) -> float:
-    """The time in s in which the gantry may reach a printing speed such that the drive follows the flow of
-    each of the extruders (`ramp_that_loses_little`), in whole hundredths; at most longest_s."""
+    """Returns the time in s in which the gantry may reach a printing speed so that the drive follows the flow
+    of each of the extruders (`ramp_that_loses_little`), rounded up to hundredths; at most longest_s."""
     ramps = [
         ramp_that_loses_little(
             extruder, drive, steady_flow=steady_flow, ramp_s=ramp_s, longest_s=longest_s,
@@ -129,9 +131,9 @@ def ramp_of_all(
 
 
 def flow(extruder: Extruder, r: np.ndarray, drive: Drive, sample_time_s: float) -> np.ndarray:
-    """The flow (T,) in mm^3/s nearest to r (T,) that the drive lets the extruder's gain, time constant and
-    yield press out; its delay and lag, which a command can be sent ahead of, its play and creep are left
-    out (a lag overshoots its input by 5 %, so that a percent more may be in reach)."""
+    """Returns the flow (T,) in mm^3/s nearest to r (T,) that the drive can press out of the extruder's gain,
+    time constant and yield. Delay and lag are left out, because a command can be sent earlier, and so are
+    play and creep. (A lag overshoots its input by 5 %, so about a percent more may be reachable.)"""
     a, yield_ = math.exp(-sample_time_s / extruder.time_constant_s), extruder.yield_
     scale = extruder.gain * (1 - a)
     x = nearest(
@@ -145,8 +147,8 @@ def flow(extruder: Extruder, r: np.ndarray, drive: Drive, sample_time_s: float) 
 
 
 def lost(extruder: Extruder, r: np.ndarray, drive: Drive, sample_time_s: float) -> float:
-    """r.m.s. error of the nearest flow to r (T,) in mm^3/s that the drive allows, as share of that of on-off
-    control r / K without limits."""
+    """Returns the r.m.s. error of the nearest flow to r (T,) in mm^3/s that the drive allows, as share of
+    that of on-off control r / K without limits."""
     a = math.exp(-sample_time_s / extruder.time_constant_s)
     on_off = np.linalg.norm(scipy.signal.lfilter([0.0, 1 - a], [1.0, -a], r) - r)
     least = np.linalg.norm(flow(extruder, r, drive, sample_time_s) - r)
@@ -156,7 +158,8 @@ def lost(extruder: Extruder, r: np.ndarray, drive: Drive, sample_time_s: float) 
 def _line(
     extruder: Extruder, steady_flow: float, slow_s: float, ramp_s: float, sample_time_s: float
 ) -> np.ndarray:
-    """Wanted flow (T,) of a line whose plateau lasts two time constants, at rest for as long before it."""
+    """Returns the wanted flow (T,) of a line whose plateau lasts two time constants, with a rest of the same
+    length before it."""
     rest = 2 * extruder.time_constant_s + ramp_s
     t = np.arange(round((3 * rest + 2 * slow_s) / sample_time_s)) * sample_time_s
     up, down = (
@@ -167,8 +170,8 @@ def _line(
 
 
 def _same(hold: np.ndarray, ahead: np.ndarray) -> bool:
-    """Whether the limits hold a piece at its begin by as much as the one before foretold: what follows acts
-    on what lies before by nothing else."""
+    """Returns whether the limits act on the begin of a piece as strongly as the piece before predicted. Later
+    samples affect earlier ones in no other way."""
     n = min(8, hold.shape[1], ahead.shape[1])
     off = np.abs(hold[:, :n] - ahead[:, :n])
     return bool(off.max() <= JOINED * max(1.0, np.abs(hold[:, :n]).max()))
@@ -185,11 +188,11 @@ def _piece(
     x: float,
     v: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """x (N,) nearest to s (N,), or `below` where `free`, that goes on from the last x and v within the
-    limits; and by how much these hold v and its change back (2, N), in the unit of x.
+    """Returns x (N,) nearest to s (N,), or to `below` if `free` and below s, that continues from the last x
+    and v within the limits; and how strongly the limits act on v and on its change (2, N), in the unit of x.
 
     A primal-dual interior-point method on slack and multiplier of each limit (Wright 1997, Primal-Dual
-    Interior-Point Methods), with half the iterations of the barrier's, each as O(N).
+    Interior-Point Methods). It needs half the iterations of the barrier method, each O(N) too.
     """
     most = np.array([[1 / bound], [1 / step]])  # a limit that there is not: 0
     # it sets out within the limits: the command goes to 0 at half of the speed
@@ -230,22 +233,22 @@ def _piece(
 
 
 def _change(z: np.ndarray, pole: float) -> np.ndarray:
-    """z(t) - pole z(t-1) (N,), from rest."""
+    """Returns z(t) - pole z(t-1) (N,), from rest."""
     v = z.copy()
     v[1:] -= pole * z[:-1]
     return v
 
 
 def _sent(y: np.ndarray, pole: float) -> np.ndarray:
-    """The transpose of `_change` on y (N,)."""
+    """Returns the transpose of `_change` applied to y (N,)."""
     z = y.copy()
     z[:-1] -= pole * y[1:]
     return z
 
 
 def _band(w: np.ndarray | float, firm: np.ndarray, pole: float) -> np.ndarray:
-    """Lower bands (3, N) of diag(w) + A' (diag(firm[0]) + C' diag(firm[1]) C) A, C the matrix of
-    `_change` with pole 1 and A that with `pole`; firm (2, N)."""
+    """Returns the lower bands (3, N) of diag(w) + A' (diag(firm[0]) + C' diag(firm[1]) C) A. C is the matrix
+    of `_change` with pole 1 and A the one with `pole`; firm (2, N)."""
     a, band = pole, np.zeros((3, firm.shape[1]))
     still, next_ = firm[0] + firm[1], firm[1, 1:]
     still[:-1] += next_  # the inner bands: still, and -next_ beside it
@@ -258,8 +261,9 @@ def _band(w: np.ndarray | float, firm: np.ndarray, pole: float) -> np.ndarray:
 
 
 def _solved(band: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    """Newton's step (N,) of the lower bands (B, N); a larger diagonal where rounding makes them indefinite
-    (poles near 1 in a row): a shorter step of the same descent."""
+    """Returns Newton's step (N,) for the lower bands (B, N). If rounding makes them indefinite (poles near 1
+    in a row), the diagonal is increased, which gives a shorter step of the same descent. Raises ValueError if
+    that is not enough."""
     for share in (0.0, 1e-13, 1e-11, 1e-9):
         try:
             whole = np.vstack([band[:1] * (1 + share), band[1:]])

@@ -82,7 +82,7 @@ OPTIONAL = {
     "print_id": "the file is one print",
     "nozzle_tip_x": "the tip is that of the settings",
     "timestamp": "the order of the rows is not checked",
-    DIRECTION: "the travel direction is that of the ground, where it is seen to move, or of the only line",
+    DIRECTION: "the travel direction is that of the ground, if it is seen to move, or of the only line",
 }
 # beside flow and target temperature, what is constant within a segment where the file has it
 SETTINGS = ("feed_rate", "z_offset")
@@ -745,7 +745,7 @@ def _read_recording(
     else:
         sentence = (
             "its temperature changes all the time, so it is measured and ends no segment; "
-            "map the setpoint where there is one"
+            "map the setpoint if there is one"
         )
         notes.append(Note("temperature", "temperature_degC", 1, sentence))
     reasons = areas.reasons

@@ -1,10 +1,11 @@
-"""Camera frame -> sub-pixel bead width along the line, or the reason why there is none; pixels -> millimetres
-on known widths; width -> cross-section.
+"""Measures the width of the bead along the line in a camera frame, to fractions of a pixel, or gives the
+reason why there is none. Also converts pixels to millimetres by known widths, and width to cross-section.
 
-Both edges lie along the rows of the frame: outermost significant run, then the half level of the plateau
-beside each edge. A specular line on the bead has a stronger gradient than its edges, glare moves the
-background, shading bends the plateau, and texture lies beside it: so nothing here looks for the strongest
-gradient. The functions of the edges take k frames at once: k small calls cost more than one large one.
+Both edges lie along the rows of the frame. First the outermost significant run is found, then the half level
+of the plateau beside each edge. A specular line on the bead has a stronger gradient than its edges, glare
+changes the background, shading bends the plateau, and texture lies beside it, so nothing here looks for the
+strongest gradient. The functions for edges take k frames at once, because k small calls cost more than one
+large call.
 """
 
 import functools
@@ -86,7 +87,8 @@ class Bead(NamedTuple):
 
 
 def area(width: np.ndarray | float, contact_angle_deg: float) -> np.ndarray | float:
-    """Cross-section in mm^2 of a bead w mm wide, the circular segment that meets the substrate at theta:
+    """Returns the cross-section in mm^2 of a bead w mm wide, the circular segment that meets the substrate at
+    theta:
 
         A = c w^2,   c = (theta - sin theta cos theta) / (4 sin^2 theta)
 
@@ -102,8 +104,8 @@ def area(width: np.ndarray | float, contact_angle_deg: float) -> np.ndarray | fl
 
 
 class WidthCalibration(NamedTuple):
-    """Width in mm = gain px + offset. deviation is the r.m.s. of the residuals (mm, two parameters taken
-    off), residuals (n,) known less fitted in mm."""
+    """Width in mm = gain px + offset. `deviation`: r.m.s. of the residuals in mm (with two degrees of freedom
+    subtracted); `residuals` (n,): known less fitted in mm."""
 
     gain: float
     offset: float
@@ -112,11 +114,11 @@ class WidthCalibration(NamedTuple):
 
 
 def calibrate(widths_px: np.ndarray, known_mm: np.ndarray) -> WidthCalibration:
-    """Gain (mm/px) and offset (mm) by least squares from measured widths (n,)
-    in px of beads or gauges of known widths (n,) in mm.
+    """Returns gain (mm/px) and offset (mm) by least squares from measured widths (n,) in px of beads or
+    gauges of known widths (n,) in mm.
 
-    Raises ValueError for fewer than three different widths, a measurement that
-    failed, or widths that do not grow with the known ones.
+    Raises ValueError if there are fewer than three different widths, if a measurement failed, or if widths do
+    not grow with the known ones.
     """
     px, mm = np.asarray(widths_px, float), np.asarray(known_mm, float)
     if px.shape != mm.shape or px.ndim != 1 or len(np.unique(mm)) < 3:
@@ -144,8 +146,9 @@ def calibrate(widths_px: np.ndarray, known_mm: np.ndarray) -> WidthCalibration:
 
 
 def edge_deviation(blur_px: float, contrast: float) -> float:
-    """By how much in px a width may be off at this blur and contrast (in levels of 0..255) beyond noise: a
-    blurred edge has not come to rest where its levels are read, and half a level of rounding moves it.
+    """Returns by how much in px a width may be off at this blur and contrast (in levels of 0..255), in
+    addition to noise. A blurred edge has not reached its final level in the rows that are read, and half a
+    level of rounding shifts it.
 
         3 s Phi(-x / s) + sqrt(2 pi) s / contrast,   s = blur_px, x = the first row that is read
 
@@ -157,8 +160,8 @@ def edge_deviation(blur_px: float, contrast: float) -> float:
 
 
 def drawn(frame: np.ndarray, bead: Bead) -> np.ndarray:
-    """The frame as (h, w, 3) uint8 RGB with the measured edges as green lines, for a report; blocks without a
-    width stay bare, a rejected frame gets a red border."""
+    """Returns the frame as (h, w, 3) uint8 RGB with the measured edges as green lines, for a report. Blocks
+    without a width have no line; a rejected frame has a red border."""
     scale = 1 if frame.dtype == np.uint8 else 1 / 257
     picture = cv2.cvtColor((gray(frame) * scale).astype(np.uint8), cv2.COLOR_GRAY2RGB)
     if bead.reason:
@@ -171,8 +174,8 @@ def drawn(frame: np.ndarray, bead: Bead) -> np.ndarray:
 
 
 def gray(frame: np.ndarray) -> np.ndarray:
-    """frame as (h, w) uint8 or uint16: gray as it is, colour (h, w, 3 or 4) in OpenCV's order BGR(A) by 0.114
-    B + 0.587 G + 0.299 R. Raises ValueError for all else."""
+    """Returns the frame as (h, w) uint8 or uint16. Gray is kept; colour (h, w, 3 or 4) in OpenCV's order
+    BGR(A) becomes 0.114 B + 0.587 G + 0.299 R. Raises ValueError for any other shape or type."""
     kind = "frame: expected (height, width) or (height, width, 3 or 4) of uint8 or uint16"
     if frame.dtype not in (np.uint8, np.uint16) or frame.ndim not in (2, 3):
         raise ValueError(
@@ -186,14 +189,15 @@ def gray(frame: np.ndarray) -> np.ndarray:
 
 
 def measure(frame: np.ndarray, *, columns: tuple[int, int], longest_blur_px: float, sign: int = 0) -> Bead:
-    """The bead's width in every block of 8 columns of frame[:, first:last] (`columns`: the part that the
-    nozzle does not hide), the line along the image's x.
+    """Measures the bead's width in every block of 8 columns of frame[:, first:last] (`columns`: the part that
+    the nozzle does not hide). The line lies along the image's x.
 
-    Profile of each block less the background between its ends; outermost significant run; half level of the
-    plateau beside the edge, clipped at the bead's median so that the specular line cannot lift it, and
-    extrapolated to the edge against shading. Bright and dark beads alike, or those of one `sign` (1 bright,
-    -1 dark) where the colour is known and shadows lie about. A frame without a usable bead comes
-    back with its reason; one that is no image, or too small, raises ValueError.
+    The profile of each block is taken less the background between its ends. In it the outermost significant
+    run is found, and then the half level of the plateau beside each edge. This plateau is clipped at the
+    bead's median, so that the specular line cannot raise it, and extrapolated to the edge against shading.
+    Bright and dark beads are measured alike; `sign` (1 bright, -1 dark) restricts the search to one kind, if
+    the colour is known and there are shadows. A frame without a usable bead is returned with its reason.
+    Raises ValueError if a frame is no image or too small.
     """
     return measure_all([frame], columns=columns, longest_blur_px=longest_blur_px, sign=sign)[0]
 
@@ -201,8 +205,8 @@ def measure(frame: np.ndarray, *, columns: tuple[int, int], longest_blur_px: flo
 def measure_all(
     frames: Sequence[np.ndarray], *, columns: tuple[int, int], longest_blur_px: float, sign: int = 0
 ) -> list[Bead]:
-    """`measure` of each frame, all of one size and kind: the same numbers, each in
-    a third of the time where sixteen come together."""
+    """Returns `measure` of each frame, all of one size and type, with identical numbers. With sixteen frames
+    at once each takes a third of the time. Raises ValueError also if sizes or types differ."""
     frames = [gray(frame) for frame in frames]
     kinds = {(frame.shape, frame.dtype.name) for frame in frames}
     if len(kinds) > 1:
@@ -256,7 +260,7 @@ def measure_all(
 
 
 def _is_ragged(widths: np.ndarray) -> bool:
-    """Whether the widths (n,) in px of neighbouring blocks zigzag, as those of grain do and of no line."""
+    """Returns whether the widths (n,) in px of neighbouring blocks zigzag, as grain does but no line."""
     bends = np.abs(np.diff(widths, 2))
     return bool(np.median(bends) > RAGGED * np.median(widths) + RAGGED_PX)
 
@@ -270,7 +274,8 @@ def _bead(
     blur: float,
     contrast: float,
 ) -> Bead:
-    """The line through the edges: vertical distances are turned to widths across it."""
+    """Returns the bead with the line through its edges. Vertical distances are converted to widths across the
+    line."""
     x, lower, upper = where[good], top[good], bottom[good]
     x = x - x.sum() / len(x)
     slope = float(x @ (lower + upper) / (2 * x @ x))
@@ -282,8 +287,8 @@ def _bead(
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Value at x = 0 of the line through y and its standard deviation; points beyond three robust deviations
-    of the first fit are left out of the second."""
+    """Returns the value at x = 0 of the line through y, and its standard deviation. Points beyond three
+    robust deviations of the first fit are left out of the second."""
     a, b = x, y
     for _ in range(2):
         middle, mean = a.sum() / len(a), b.sum() / len(b)
@@ -300,8 +305,8 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 
 def profiles(frames: list[np.ndarray], columns: tuple[int, int]) -> np.ndarray:
-    """(frames, blocks, rows) sums of 8 columns each. The transposed
-    copy makes every later pass run along memory."""
+    """Returns sums (frames, blocks, rows) of 8 columns each. The copy is transposed so that every later pass
+    reads memory in order. Raises ValueError if the frame has too few rows or columns."""
     first, last = columns
     h, w = frames[0].shape
     n = (last - first) // BLOCK
@@ -319,9 +324,9 @@ def profiles(frames: list[np.ndarray], columns: tuple[int, int]) -> np.ndarray:
 
 
 class CoarseEdges(NamedTuple):
-    """Of k frames: rows (2, k, n) of the coarse edges; blocks (k, n) bool with a solid run,
-    with an unclear one, with one that the frame cuts; plateau (k,) in levels above background,
-    NONE without a bead; sign (k,), saturated (k,)."""
+    """The coarse edges of k frames. `rows` (2, k, n); blocks (k, n) bool: `solid` with a solid run, `unclear`
+    with an unclear one, `cut` with one that the frame cuts; `plateau` (k,) in levels above background, NONE
+    without a bead; `sign` (k,); `saturated` (k,)."""
 
     rows: np.ndarray
     solid: np.ndarray
@@ -333,11 +338,11 @@ class CoarseEdges(NamedTuple):
 
 
 def coarse(g: np.ndarray, level: float, bead_sign: int = 0) -> CoarseEdges:
-    """The outermost run above half the plateau in each block, on rows averaged by four.
+    """Finds the outermost run above half the plateau in each block, on rows averaged by four.
 
-    Background is the straight line between the means of the first and the last sixteenth of the rows; its
-    noise counts as at least half a gray level. What is significant has steps over 16 rows; glare swells
-    without any. The plateau is the median of all that reaches STEEP of those steps.
+    Background is the straight line between the means of the first and the last sixteenth of the rows. Its
+    noise counts as at least half a gray level. Significant blocks have steps over 16 rows; glare rises
+    without such steps. The plateau is the median of all values that reach STEEP of those steps.
     """
     k, n, h = g.shape[0], g.shape[1], g.shape[2] // COARSE
     m, ends, line = _background(h)
@@ -373,8 +378,8 @@ def coarse(g: np.ndarray, level: float, bead_sign: int = 0) -> CoarseEdges:
 
 
 def _plateau(d: np.ndarray, m: int, level: float, bead_sign: int) -> tuple[float, float, float]:
-    """Of one frame: median of the significant steps, median of what reaches STEEP of them, sign of the bead;
-    NONE and 1 where nothing is significant."""
+    """Returns for one frame: median of the significant steps, median of the values that reach STEEP of them,
+    sign of the bead; NONE, NONE and 1 if nothing is significant."""
     noise = max(math.hypot(cv2.norm(d[:, :m]), cv2.norm(d[:, -m:])) / math.sqrt(2 * m * len(d)), level / 2)
     steps = d[:, 4:] - d[:, :-4]
     steps = np.maximum(steps.max(axis=1), -steps.min(axis=1))
@@ -394,8 +399,8 @@ def _plateau(d: np.ndarray, m: int, level: float, bead_sign: int) -> tuple[float
 
 @functools.cache
 def _background(h: int) -> tuple[int, np.ndarray, np.ndarray]:
-    """Rows in a sixteenth; (h, 2) that takes the mean of the first and of the last;
-    (2, h) that draws the straight line between them."""
+    """Returns the rows in a sixteenth; a matrix (h, 2) that gives the means of the first and of the last
+    sixteenth; a matrix (2, h) that gives the straight line between them."""
     m = max(h // 16, 2)
     ends = np.zeros((h, 2), np.float32)
     ends[:m, 0] = ends[-m:, 1] = 1 / m
@@ -404,11 +409,11 @@ def _background(h: int) -> tuple[int, np.ndarray, np.ndarray]:
 
 
 def fine(g: np.ndarray, first: CoarseEdges) -> tuple[np.ndarray, np.ndarray]:
-    """(2, k, n) sub-pixel rows of the top and the bottom edge, and each frame's blur (k,): standard deviation
-    of its edge in px, NaN without a bead.
+    """Returns the sub-pixel rows (2, k, n) of the top and the bottom edge, and each frame's blur (k,):
+    standard deviation of its edge in px, NaN without a bead.
 
     The half level lies between the local background and the plateau beside the edge, which is extrapolated to
-    the edge against shading. Shading is the same at both edges; where one is brighter than the other, the
+    the edge against shading. Shading is the same at both edges. If one edge is brighter than the other, the
     specular line lies beside it, and the other edge gives the plateau of both.
     """
     k, n, h = g.shape
@@ -448,8 +453,8 @@ def fine(g: np.ndarray, first: CoarseEdges) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _crossing(E: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (2, k, n) inward from the middle of each window to its half level, sought from the inside outward,
-    and the rise of the row in which it lies."""
+    """Returns the rows (2, k, n) inward from the middle of each window to its half level, searched from the
+    inside outward, and the rise of the row in which it lies."""
     shape, rows = E.shape, E.shape[-1]
     E = cv2.filter2D(E.reshape(-1, rows), -1, THREE, borderType=cv2.BORDER_REPLICATE)
     half = half.ravel()
@@ -462,12 +467,12 @@ def _crossing(E: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _settled(read, steep, inward, clean, rise, width, fall, plateau) -> tuple[np.ndarray, np.ndarray]:
-    """Shift (k,) of all edges inward, and blur (k,), that agree with
-    each other; all arguments (k,), inward (2, k).
+    """Returns the inward shift (k,) of all edges and the blur (k,) that are consistent with each other. All
+    arguments are (k,), inward (2, k).
 
-    A blurred edge has not come to rest where its levels were read: what is missing there looks
-    like shading and hides the blur. And the edge lies `at` from the window's middle, so that the
-    plateau was extrapolated too far or not far enough.
+    A blurred edge has not reached its final level in the rows that are read. The missing part looks like
+    shading and hides the blur. Also, the edge lies `at` from the window's middle, so the plateau was
+    extrapolated too far or not far enough.
     """
     at, across = inward[clean].mean(axis=0), width - inward.sum(axis=0)
     p0, steep = np.maximum(read, 1e-6), np.maximum(steep, 1e-6)
@@ -488,17 +493,17 @@ def _settled(read, steep, inward, clean, rise, width, fall, plateau) -> tuple[np
 
 
 def _tail(rows: np.ndarray, at: np.ndarray, blur: np.ndarray) -> np.ndarray:
-    """Mean (k,) of Phi((at - row) / blur) over the rows: what a blurred step at `at` still lacks inside of
-    it; for rows outside give all with the other sign."""
+    """Returns the mean (k,) of Phi((at - row) / blur) over the rows: the part of a blurred step at `at` that
+    is still missing inside it. For rows outside, pass all arguments with the other sign."""
     return scipy.special.ndtr((at[:, None] - rows) / blur[:, None]).mean(axis=1)
 
 
 def _shading(rise: np.ndarray, width: np.ndarray, into: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """How far the level falls from the near rows to the edge, and its slope there, where it rises by `rise`
-    from the near to the far rows; the edge is `into` from the window's middle.
+    """Returns how far the level falls from the near rows to the edge, and its slope there, if it rises by
+    `rise` from the near to the far rows. The edge is `into` from the window's middle.
 
-    The level across the bead is taken as a - b u, u = (1 - 2 x / w)^2, x from the edge: the first term of
-    every shading that is the same on both sides.
+    The level across the bead is assumed as a - b u, u = (1 - 2 x / w)^2, with x from the edge: the first term
+    of every shading that is the same on both sides.
     """
     near = (1 - 2 * (NEAR_ROW - into) / width) ** 2 + 4 * NEAR_VARIANCE / width**2
     far = (1 - 2 * (FAR_ROW - into) / width) ** 2 + 4 * FAR_VARIANCE / width**2
@@ -507,7 +512,8 @@ def _shading(rise: np.ndarray, width: np.ndarray, into: np.ndarray | float) -> t
 
 
 def _along(levels: np.ndarray, has_bead: np.ndarray) -> np.ndarray:
-    """levels (edges, k, n) averaged over nine blocks along the bead, blocks without a bead left out."""
+    """Returns levels (edges, k, n) averaged over nine blocks along the bead, without the blocks that have no
+    bead."""
     near = _neighbours(levels.shape[-1])
     weight = has_bead.astype(np.float32)
     return (levels * weight) @ near / np.maximum(weight @ near, np.float32(1e-9))

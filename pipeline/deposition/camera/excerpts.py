@@ -19,8 +19,8 @@ def excerpts(
     *,
     scale: tuple[float, float],
 ) -> Iterator[tuple[int, np.ndarray, dict[str, Any]]]:
-    """(number, picture (h, w, 3) in RGB, figures) of the frames to show; signals {name: (time_s (n,), values
-    (n,))} have the gantry's place and speed, scale is (px_per_mm, offset_px) of the widths."""
+    """Yields (number, picture (h, w, 3) in RGB, figures) of the frames to show. signals {name: (time_s (n,),
+    values (n,))} have the gantry's place and speed; scale is (px_per_mm, offset_px) of the widths."""
     gantry, (px_per_mm, offset_px) = signals["position_mm"], scale
     times, beads = [], []
     for time, _, one in measure_beads(frames, gantry, mounting):
@@ -44,9 +44,9 @@ def excerpts(
 def places_to_show(
     beads: Sequence[tuple[float, Bead]], time_s: np.ndarray, speed: np.ndarray, *, travel_mm: float
 ) -> dict[int, str]:
-    """Numbers of the frames to show, and what they show: start, steady line, corner, and the first that was
-    rejected for each reason. beads are (time, bead) of all frames, speed (n,) at time_s (n,) is the gantry's.
-    After its pause the corner travels travel_mm until it is in the middle of what is measured."""
+    """Returns numbers of the frames to show, and what they show: start, steady line, corner, and the first
+    frame rejected for each reason. beads are (time, bead) of all frames; speed (n,) at time_s (n,) is the
+    gantry's. After the pause the corner travels travel_mm to the middle of the measured columns."""
     full = np.median([one.width for _, one in beads if not one.reason] or [0.0])
     good = [k for k, (_, one) in enumerate(beads) if not one.reason and one.width > 0.7 * full]
     rejected = {one.reason: k for k, (_, one) in reversed(list(enumerate(beads))) if one.reason}
@@ -66,7 +66,7 @@ def places_to_show(
 
 
 def cut(picture: np.ndarray, measured: Bead) -> np.ndarray:
-    """The picture (h, w, 3) cut to its middle half around the bead, at three quarters of its size."""
+    """Returns the picture (h, w, 3) cut to its middle half around the bead, at three quarters of its size."""
     h = picture.shape[0]
     edges = np.concatenate([measured.top, measured.bottom])
     middle = float(np.nanmean(edges)) if np.isfinite(edges).any() and not measured.reason else h / 2

@@ -1,9 +1,9 @@
 """Widths of many frames -> cross-section along the line -> flow Q(t) by regularised inversion, with its
-uncertainty and what the frames cannot tell.
+uncertainty and the times that the frames do not show.
 
-Width belongs to a place, not to a moment: the nozzle at x(t) lays Q(t) dt over its footprint f, so that A(s)
-= integral of Q(t) f(s - x(t)) dt, and each place is seen in many frames. Q comes back from A by least squares
-against a smoothness prior whose strength the data choose.
+A width belongs to a place, not to a moment. The nozzle at x(t) lays Q(t) dt over its footprint f, so A(s) =
+integral of Q(t) f(s - x(t)) dt, and many frames show each place. Q is computed from A by least squares with a
+smoothness prior, and the data choose the strength of the prior.
 """
 
 import math
@@ -38,19 +38,20 @@ RIDGE = 1e-6
 
 
 class View(NamedTuple):
-    """Where the camera looks: a column shows the stage at s = x + (column -
-    nozzle_column) mm_per_px, x the gantry's position.
+    """The part of the stage that the camera shows: a column shows s = x + (column - nozzle_column) mm_per_px,
+    with x the gantry's position.
 
-    mm_per_px is negative where the line trails towards higher columns."""
+    mm_per_px is negative if the line trails towards higher columns.
+    """
 
     mm_per_px: float
     nozzle_column: float
 
 
 class Sections(NamedTuple):
-    """Cross-section along the stage: centres s (n,) in mm of places 8 px long, area (n,) in
-    mm^2 and its standard deviation as the frames scatter, and the number of frames (n,) that
-    saw each."""
+    """Cross-section along the stage. `s` (n,): centres in mm of places 8 px long; `area` (n,) in mm^2;
+    `deviation` (n,): its standard deviation from the scatter of the frames; `frames` (n,): number of readings
+    of each place; `length` of a place in mm."""
 
     s: np.ndarray
     area: np.ndarray
@@ -60,12 +61,12 @@ class Sections(NamedTuple):
 
 
 class Flow(NamedTuple):
-    """Q (T,) in mm^3/s at the gantry's samples and its standard
-    deviation, given the smoothness that the data chose.
+    """Q (T,) in mm^3/s at the gantry's samples and its standard deviation, for the smoothness that the data
+    chose.
 
-    observable (T,) is False where the gantry stood or the camera never saw what was laid: there only
-    the volume of the whole pause is measured, and Q is its likeliest spread over time. `outliers` are
-    the places that were given less than half their weight.
+    observable (T,) is False if the gantry stood or the camera never saw what was laid. There only the volume
+    of the whole pause is measured, and Q is its most likely distribution over time. `outliers`: number of
+    places with less than half their weight.
     """
 
     flow: np.ndarray
@@ -75,11 +76,12 @@ class Flow(NamedTuple):
 
 
 def deposit_share(distance: np.ndarray, radius: float) -> np.ndarray:
-    """Share of what leaves a round nozzle that falls behind `distance` ahead of its middle:
+    """Returns the share of the material from a round nozzle that falls behind a point `distance` ahead of its
+    middle:
 
         1/2 + (z sqrt(1 - z^2) + arcsin z) / pi,   z = distance / radius in -1..1
 
-    Its derivative is the footprint f: the chord of the nozzle at that distance, over its area.
+    Its derivative is the footprint f: the chord of the nozzle at that distance, divided by its area.
     """
     z = np.clip(distance / radius, -1.0, 1.0)
     return 0.5 + (z * np.sqrt(1 - z * z) + np.arcsin(z)) / np.pi
@@ -94,12 +96,12 @@ def sections(
     nozzle_radius_mm: float,
     contact_angle_deg: float,
 ) -> Sections:
-    """A(s) from widths (F, m) in mm at the `columns` (m,) of F frames taken with the gantry at `position`
-    (F,); NaN is unread, 0 is bare substrate.
+    """Returns A(s) from widths (F, m) in mm at the `columns` (m,) of F frames taken with the gantry at
+    `position` (F,). In widths NaN is unread and 0 is bare substrate.
 
-    Readings are gathered by place. Those closer to the nozzle than its radius, where the bead still grows,
-    are left out; so are those beyond five robust deviations from the median of their place. Raises ValueError
-    if nothing is left, or if the gantry does not move away from what the camera sees.
+    Readings are collected by place. Readings closer to the nozzle than its radius, where the bead still
+    grows, are left out, and so are readings beyond five robust deviations from the median of their place.
+    Raises ValueError if no reading remains, or if the gantry does not move away from what the camera sees.
     """
     s, w = _readings(position, columns, widths, view, nozzle_radius_mm)
     px = abs(view.mm_per_px)
@@ -118,9 +120,9 @@ def sections(
 
 
 def column_trend(position: np.ndarray, columns: np.ndarray, widths: np.ndarray, view: View) -> float:
-    """By which share one place of the line looks wider at the last of the `columns` (m,) than at the first,
-    of widths (F, m) as for `sections`: least squares over readings of the same place, those near the median
-    width. 0 where no place is seen twice. A camera that looks square to the stage shows none."""
+    """Returns the share by which one place of the line looks wider at the last of the `columns` (m,) than at
+    the first, from widths (F, m) as in `sections`: least squares over readings of the same place, with widths
+    near the median. 0 if no place was read twice. For a camera square to the stage it is 0."""
     behind = (columns - view.nozzle_column) * view.mm_per_px
     usual = float(np.median(widths[widths > 0])) if (widths > 0).any() else math.nan
     used = np.abs(widths - usual) < NEAR_USUAL * usual
@@ -137,8 +139,8 @@ def column_trend(position: np.ndarray, columns: np.ndarray, widths: np.ndarray, 
 def _readings(
     position: np.ndarray, columns: np.ndarray, widths: np.ndarray, view: View, nozzle_radius_mm: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places (N,) in mm and widths (N,) in mm of the readings that count. Raises ValueError if there is
-    none, or if the gantry goes back."""
+    """Returns places (N,) in mm and widths (N,) in mm of the readings that count. Raises ValueError if there
+    is none, or if the gantry goes back."""
     behind = (columns - view.nozzle_column) * view.mm_per_px
     used = np.isfinite(widths) & (np.abs(behind) >= nozzle_radius_mm) & np.isfinite(position)[:, None]
     if not used.any():
@@ -158,8 +160,8 @@ def _readings(
 
 
 def _without_specks(place: np.ndarray, w: np.ndarray, px: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """For readings w (N,) sorted by place and width: the index of their place (N,), whether they count (N,),
-    and the robust scatter of one reading in mm."""
+    """Returns, for readings w (N,) sorted by place and width: the index of their place (N,), whether they
+    count (N,), and the robust scatter of one reading in mm."""
     first = np.flatnonzero(np.diff(place, prepend=-1))
     count = np.diff(np.append(first, len(place)))
     of = np.repeat(np.arange(len(first)), count)
@@ -182,18 +184,19 @@ def estimate(
     contact_angle_deg: float,
     width_deviation_mm: float,
 ) -> Flow:
-    """Q(t) = z + shapes' a at the samples time_s (T,), evenly spaced, of the gantry's position (T,), from
+    """Estimates Q(t) = z + shapes' a at the evenly spaced samples time_s (T,) of the gantry's position (T,),
+    from
 
         min |W (A - K Q)|^2 + strength |D2 z|^2
         K[i, k] = mean over place i of integral of hat_k(t) f(s - x(t)) dt
 
-    D2 the second difference: z is an integrated random walk, and the shapes (k, T) are where the flow may
-    turn sharply, each by an amplitude that the data choose (the wanted flow r as one row; a model's answer to
-    the command; none, as zeros (0, T)). The strength maximises the likelihood of A with all Q integrated out
-    (generalised maximum likelihood, Wahba 1985). W carries the deviations of A, scaled to its scatter about
-    the fit, and Huber's weights. `width_deviation_mm` is what a calibration leaves: it moves all widths
-    alike, so that Q is uncertain by Q 2 dw / w on top. Raises ValueError if no place is reached by the
-    nozzle.
+    D2 is the second difference, so z is an integrated random walk. The shapes (k, T) are the times when the
+    flow may turn sharply, each with an amplitude that the data choose: the wanted flow r as one row, a
+    model's answer to the command, or none, as zeros (0, T). The strength maximises the likelihood of A with
+    all Q integrated out (generalised maximum likelihood, Wahba 1985). W has the deviations of A, scaled to
+    its scatter about the fit, and Huber's weights. `width_deviation_mm` is the error that remains after
+    calibration. It is common to all widths and adds Q 2 dw / w to the uncertainty of Q. Raises ValueError if
+    the nozzle reaches no place.
     """
     dt = float(np.mean(np.diff(time_s)))
     K = _laid(position, dt, sections, nozzle_radius_mm)
@@ -221,8 +224,8 @@ def estimate(
 def _robust_fit(
     K: scipy.sparse.csr_matrix, A: np.ndarray, expected: np.ndarray, bead: np.ndarray, shapes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """The flow Q (T,), its deviation (T,), and how many places are outliers: least squares with Huber's
-    weights, reweighted ROUNDS times; each time the likeliest strength."""
+    """Returns the flow Q (T,), its deviation (T,), and the number of outlier places. Least squares with
+    Huber's weights, reweighted ROUNDS times, each time with the most likely strength."""
     steps = K.shape[1]
     P, robust = _penalty(steps), np.ones(len(A))
     deviation = np.where(bead, _roughness(A, expected, bead) * expected, expected)
@@ -247,9 +250,10 @@ def _robust_fit(
 
 
 def _roughness(A: np.ndarray, expected: np.ndarray, bead: np.ndarray) -> float:
-    """Scatter of A along the stage over what the frames' scatter lets expect, at least 1: robust deviation of
-    the second differences of means over three places, which flow hardly moves. What lies on the stage errs
-    alike in every frame, so only this shows it; neighbours share readings, hence the means."""
+    """Returns the scatter of A along the stage divided by the one expected from the frames' scatter, at least
+    1. It is the robust deviation of the second differences of means over three places, which flow hardly
+    changes. Things on the stage cause the same error in every frame, so only this shows them. Means are used
+    because neighbours share readings."""
     n = len(A) // 3
     mean, variance = (
         A[: 3 * n].reshape(n, 3).mean(axis=1),
@@ -264,8 +268,8 @@ def _roughness(A: np.ndarray, expected: np.ndarray, bead: np.ndarray) -> float:
 
 
 def _laid(position: np.ndarray, dt: float, sections: Sections, radius: float) -> scipy.sparse.csr_matrix:
-    """K (n, T) in s/mm: section at place i from unit flow at sample k;
-    positions straight between samples, flow too."""
+    """Returns K (n, T) in s/mm: the section at place i from unit flow at sample k. Positions and flow are
+    linear between samples."""
     share = (np.arange(INSTANTS) + 0.5) / INSTANTS
     x = (position[:-1, None] + np.diff(position)[:, None] * share).ravel()
     begin = np.searchsorted(sections.s, x - radius - sections.length / 2)
@@ -314,7 +318,7 @@ _Data = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]
 
 
 class _Fit(NamedTuple):
-    """Cholesky factor of M + strength P, Schur complement S (k, k) of the amplitudes, z (T,), a (k,), and -2
+    """Cholesky factor of M + strength P; Schur complement S (k, k) of the amplitudes; z (T,); a (k,); and -2
     log likelihood up to a constant."""
 
     factor: np.ndarray
@@ -325,7 +329,7 @@ class _Fit(NamedTuple):
 
 
 def _solve(log_strength: float, data: _Data) -> _Fit:
-    """Minimum over z and a by elimination of z:
+    """Minimises over z and a by elimination of z:
 
     -2 log likelihood = minimum + log det (M + strength P) + log det S - (T - 2) log strength
     """
@@ -343,8 +347,8 @@ def _solve(log_strength: float, data: _Data) -> _Fit:
 
 
 def _inverse_diagonal(band: np.ndarray) -> np.ndarray:
-    """Diagonal of the inverse of a symmetric banded matrix: blocks as wide as the band make it block
-    tridiagonal; Schur complements down, inverses up (Takahashi 1973)."""
+    """Returns the diagonal of the inverse of a symmetric banded matrix. Blocks as wide as the band make it
+    block tridiagonal; Schur complements are computed downward, inverses upward (Takahashi 1973)."""
     b, steps = len(band) - 1, band.shape[1]
     blocks = -(-steps // b)
     full = np.zeros((b + 1, blocks * b + b))

@@ -1,6 +1,5 @@
-"""A printed ladder, lines of known widths, into what a camera needs: the size of a pixel, the direction of
-the line, and by how much beads of each width look wider than they are.
-"""
+"""Calibrates a camera by a printed ladder, which is lines of known widths: the size of a pixel, the direction
+of the line, and by how much beads of each width look wider than they are."""
 
 import math
 from collections.abc import Sequence
@@ -13,8 +12,8 @@ from pipeline.deposition.camera import bead, line
 
 
 class Rung(NamedTuple):
-    """One line of the ladder as it is seen: where, how wide across it in px with its standard deviation, and
-    why it could not be measured (empty where it could). `pose` is how it was turned."""
+    """One line of the ladder in the picture: where it was found, its width across it in px with its standard
+    deviation, and why it could not be measured ("" if it could). `pose`: how it was turned."""
 
     found: line.ImageLine
     pose: line.Pose
@@ -27,7 +26,7 @@ class Rung(NamedTuple):
 
 class Ladder(NamedTuple):
     """mm_per_px > 0; rotation_deg of the lines; known (n,) in mm and measured (n,) in px, growing; edge_bias
-    (n,) in px by which each looks wider than it is; deviation_px, the scatter of repeated pictures."""
+    (n,) in px by which each looks wider than it is; deviation_px: the scatter of repeated pictures."""
 
     mm_per_px: float
     rotation_deg: float
@@ -45,9 +44,9 @@ def rungs(
     hidden_px: float,
     longest_blur_px: float,
 ) -> list[Rung]:
-    """The `count` lines of one picture that stand out most, measured; fewer where it shows fewer. One line is
-    sought at the nozzle's tip where that is given. Several are all light or all dark: what lies between them
-    is one fewer."""
+    """Measures the `count` lines of one picture that stand out most; fewer if it shows fewer. A single line
+    is searched at the nozzle's tip if that is given. Several lines are all light or all dark, because the
+    stripes between them would be found too, one fewer than the lines."""
     if count == 1:
         return _of_sign(frame, 1, tip=tip, hidden_px=hidden_px, sign=0, longest_blur_px=longest_blur_px)
     both = [
@@ -66,7 +65,7 @@ def _of_sign(
     sign: int,
     longest_blur_px: float,
 ) -> list[Rung]:
-    """The lines of one colour: 1 light, -1 dark, 0 either."""
+    """Returns the lines of one colour: 1 light, -1 dark, 0 either."""
     mask = np.zeros(frame.shape[:2], bool)
     if tip is not None and count > 1:
         cv2.circle(hidden := mask.astype(np.uint8), (round(tip[0]), round(tip[1])), round(hidden_px), 1, -1)
@@ -85,7 +84,8 @@ def _of_sign(
 
 
 def _measured(frame: np.ndarray, found: line.ImageLine, behind_px: float, longest_blur_px: float) -> Rung:
-    """The line of a picture, turned a second time where the first measurement shows that it lies askew."""
+    """Measures the line of a picture. It is turned and measured a second time with the direction of the first
+    measurement."""
     for _ in range(2):
         pose = line.pose_on(found, (frame.shape[0], frame.shape[1]), behind_px=behind_px)
         one = bead.measure(
@@ -110,7 +110,7 @@ def _measured(frame: np.ndarray, found: line.ImageLine, behind_px: float, longes
 
 
 def _covered(shape: tuple[int, int], found: line.ImageLine) -> np.ndarray:
-    """(h, w) bool: what a line and its edges cover of a picture."""
+    """Returns (h, w) bool: the pixels that a line and its edges cover."""
     a = math.radians(found.angle_deg)
     y, x = np.mgrid[: shape[0], : shape[1]]
     across = (y - found.y) * math.cos(a) - (x - found.x) * math.sin(a)
@@ -125,13 +125,13 @@ def calibrated(
     mm_per_px: float | None,
     from_tip: bool,
 ) -> Ladder:
-    """From pictures (N,) of lines of known widths: scale, direction and edge bias by width.
+    """Returns scale, direction and edge bias by width from pictures (N,) of lines of known widths.
 
-    mm_per_px is the size of a pixel where something that has no edges tells it, such as the pitch of the
-    ladder; else it is the slope of known over measured widths, so that the mean bias is the same at all of
-    them. Directions `from_tip` count over the whole circle, others to half of it. Raises ValueError for fewer
-    than three different widths, for a measurement that failed and for widths that do not grow with the known
-    ones.
+    mm_per_px is the size of a pixel if it is known from something without edges, such as the pitch of the
+    ladder. If it is None, it is the slope of known over measured widths, so the mean bias is the same at all
+    of them. Directions `from_tip` count over the whole circle, others over half of it. Raises ValueError if
+    there are fewer than three different widths, if a measurement failed, or if widths do not grow with the
+    known ones.
     """
     known, px = np.asarray(known_mm, float), np.asarray(measured_px, float)
     fit = bead.calibrate(px, known)
@@ -149,8 +149,8 @@ def calibrated(
 
 
 def pitch_px(found: Sequence[line.ImageLine]) -> float:
-    """Mean distance in px of the middles of neighbouring parallel lines: no edge enters. Raises ValueError
-    for fewer than two lines."""
+    """Returns the mean distance in px between the middles of neighbouring parallel lines. No edge affects it.
+    Raises ValueError for fewer than two lines."""
     if len(found) < 2:
         raise ValueError(
             f"ladder: expected two lines or more to measure their pitch but found {len(found)}; "

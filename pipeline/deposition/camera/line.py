@@ -1,8 +1,8 @@
-"""Where a printed line lies in a picture as it comes, and the picture turned so that it lies along the rows.
+"""Finds a printed line in a picture, and turns the picture so that the line lies along the rows.
 
-A line is a band that is brighter or darker than the ground on both of its sides, along its whole length. Its
-specular line, a stripe of the ground or a speck is that too, but narrower, fainter or shorter: what counts is
-the square of the contrast that lasts along the band, times the root of its width.
+A line is a band that is brighter or darker than the ground on both of its sides, along its whole length. So
+is its specular line, a stripe of the ground or a speck, but these are narrower, fainter or shorter. The
+measure is therefore the square of the contrast that persists along the band, times the root of its width.
 """
 
 import functools
@@ -44,9 +44,9 @@ Gantry = tuple[np.ndarray, np.ndarray]
 
 
 class ImageLine(NamedTuple):
-    """A line in a picture: its direction (0 right, 90 down), within 180 degrees where no tip says from where
-    it comes; a point in its middle and its width in px of the picture; `contrast`, bead less ground in
-    levels, and `score`, that contrast over its deviation along the line."""
+    """A line in a picture. `angle_deg`: its direction (0 right, 90 down), known only to half a circle if no
+    tip shows from where it comes; `x`, `y`: a point in its middle; `width_px`; `contrast`: bead less ground
+    in levels; `score`: that contrast divided by its deviation along the line."""
 
     angle_deg: float
     x: float
@@ -57,8 +57,8 @@ class ImageLine(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """How a picture is turned before it is measured: by -angle_deg about (x, y), which comes to lie at
-    (column, row) of the turned picture of shape (rows, columns), enlarged by `scale`."""
+    """How a picture is turned before it is measured: by -angle_deg about (x, y), enlarged by `scale`. The
+    point (x, y) moves to (column, row) of the turned picture of shape (rows, columns)."""
 
     angle_deg: float
     x: float
@@ -78,9 +78,10 @@ def find(
     mask: np.ndarray | None = None,
     sign: int = 0,
 ) -> ImageLine | None:
-    """The line with the most energy in the picture (h, w), or the one that comes out beside the nozzle's tip
-    (x, y) in px, seen from `hidden_px` on; None if there is none. What `mask` (h, w) marks is not looked
-    at. `sign` is 1 for a bead brighter than its ground, -1 for a darker one, 0 for either."""
+    """Returns the line with the most energy in the picture (h, w), or, if the nozzle's tip (x, y) in px is
+    given, the one that comes out beside it, visible from `hidden_px` on; None if there is none. Pixels marked
+    in `mask` (h, w) are ignored. `sign` is 1 for a bead brighter than its ground, -1 for a darker one, 0 for
+    either."""
     picture = gray(frame).astype(np.float32)
     h, w = picture.shape
     shrunk = max(h, w) / COARSE_PX
@@ -119,7 +120,7 @@ class _Band(NamedTuple):
 
 
 def _band(small: np.ndarray, centre, turn: float, *, hidden: float, from_tip: bool, sign: int) -> _Band:
-    """The band of most energy along direction `turn` of a small picture."""
+    """Returns the band with the most energy along direction `turn` of a small picture."""
     h, w = small.shape
     reach = math.ceil(math.hypot(h, w) / 2)
     half, first, columns = (REACH_PX, hidden, REACH_PX) if from_tip else (reach, -reach, 2 * reach)
@@ -151,9 +152,9 @@ def _band(small: np.ndarray, centre, turn: float, *, hidden: float, from_tip: bo
 
 
 def _steps(sums: np.ndarray, counts: np.ndarray, inner: int, length: int) -> tuple[np.ndarray, np.ndarray]:
-    """(rows + 1, parts) each: by how much the rows after a boundary are above those before it, and those
-    before it above those after it; `inner` rows on the bead's side, SIDE_PX beyond a row's gap on the
-    ground's. NaN where not all of them are in the picture."""
+    """Returns two arrays (rows + 1, parts): by how much the rows after a boundary are above those before it,
+    and by how much those before are above those after. It averages `inner` rows on the bead's side, and
+    SIDE_PX rows on the ground's side after a gap of one row. NaN if they are not all in the picture."""
     size = len(sums) - 1
 
     def mean(shift: int, rows: int) -> np.ndarray:
@@ -171,8 +172,8 @@ def _steps(sums: np.ndarray, counts: np.ndarray, inner: int, length: int) -> tup
 
 
 def _best_of_width(before, after, width: int, through: int, sign: int):
-    """(energy, first row, middle in parts of the length, contrast, score) of the best band of one width,
-    through the row `through` where that is not negative."""
+    """Returns (energy, first row, middle in parts of the length, contrast, score) of the best band of one
+    width, None if there is none. The band must contain the row `through` if that is not negative."""
     if width >= len(before):
         return None
     up, down = before[:-width], after[width:]
@@ -201,7 +202,8 @@ def _best_of_width(before, after, width: int, through: int, sign: int):
 
 @functools.lru_cache(maxsize=64)
 def matrix(pose: Pose) -> np.ndarray:
-    """(2, 3) that takes (column, row) of the turned picture to (x, y) of the picture as it came."""
+    """Returns the matrix (2, 3) from (column, row) of the turned picture to (x, y) of the original
+    picture."""
     a = math.radians(pose.angle_deg)
     c, s = math.cos(a) / pose.scale, math.sin(a) / pose.scale
     return np.array([
@@ -211,8 +213,8 @@ def matrix(pose: Pose) -> np.ndarray:
 
 
 def turned(frame: np.ndarray, pose: Pose) -> np.ndarray:
-    """The picture (rows, columns) in gray with the line along its rows; what lies outside of the frame
-    repeats its border."""
+    """Returns the picture (rows, columns) in gray with the line along its rows. Places outside the frame
+    repeat its border."""
     return cv2.warpAffine(
         gray(frame),
         matrix(pose),
@@ -225,9 +227,9 @@ def turned(frame: np.ndarray, pose: Pose) -> np.ndarray:
 def pose_on(
     line: ImageLine, shape: tuple[int, int], *, ahead_px: float = math.inf, behind_px: float = math.inf
 ) -> Pose:
-    """The pose in which only the line and its surroundings are left: half its width again on both sides, and
-    as much of its length, up to `longest_px`, as lies with them inside of the frame (rows, columns). A line
-    narrower than the windows of an edge is enlarged."""
+    """Returns the pose that keeps only the line and its surroundings: half its width on both sides, and as
+    much of its length as lies with them inside the frame (rows, columns), at most ahead_px and behind_px. A
+    line narrower than the windows of an edge is enlarged."""
     scale = max(1.0, round(WIDE_PX / line.width_px))
     half = math.ceil(max(line.width_px * scale, LEAST_PX / 2) * 0.9) + 8
     pose = Pose(line.angle_deg, line.x, line.y, 0.0, half - 0.5, 2 * half, LEAST_PX, scale)
@@ -239,8 +241,9 @@ def pose_on(
 
 
 def span(pose: Pose, shape: tuple[int, int], columns: tuple[int, int], half: float) -> tuple[int, int]:
-    """The first and one past the last of the first run of `columns`, counted from the pose's point, that lie
-    inside of the frame (rows, columns) over `half` rows on both sides; twice the same where none does."""
+    """Returns the first and one past the last of the first run of `columns`, counted from the pose's point,
+    that lie inside the frame (rows, columns) over `half` rows on both sides. Both are equal if there is no
+    such run."""
     M = matrix(pose._replace(column=0.0, row=0.0))
     steps = np.arange(*columns)
     ones = np.ones(len(steps))
@@ -252,15 +255,15 @@ def span(pose: Pose, shape: tuple[int, int], columns: tuple[int, int], half: flo
 
 
 def foot(line: ImageLine, x: float, y: float) -> tuple[float, float]:
-    """The point of the line that is nearest to (x, y)."""
+    """Returns the point of the line that is nearest to (x, y)."""
     a = math.radians(line.angle_deg)
     along = (x - line.x) * math.cos(a) + (y - line.y) * math.sin(a)
     return line.x + along * math.cos(a), line.y + along * math.sin(a)
 
 
 def with_room(pose: Pose, shape: tuple[int, int], columns: tuple[int, int]) -> Pose:
-    """The pose with its line in the middle of as many rows as lie inside of the frame (rows, columns) over
-    `columns`, at least LEAST_PX and at most the frame's diagonal."""
+    """Returns the pose with its line in the middle of as many rows as lie inside the frame (rows, columns)
+    over `columns`, at least LEAST_PX and at most the frame's diagonal."""
     h, w = shape
     M = matrix(pose._replace(row=0.0))
     first, last = columns[0], columns[1] - 1
@@ -278,10 +281,12 @@ def with_room(pose: Pose, shape: tuple[int, int], columns: tuple[int, int]) -> P
 
 
 class Mounting(NamedTuple):
-    """How a camera hangs: the size of a pixel in mm, negative if the line trails to higher columns; the
-    nozzle's column and the columns that are measured; `sign` 1 for a bead brighter than its ground, -1 for a
-    darker one, 0 if nobody said; the direction of the line and the tip (x, y) in px, None if unknown; the
-    polygon that the nozzle hides; and pairs in px: a width, and by how much wider it looks."""
+    """How a camera is mounted. `mm_per_px`: size of a pixel in mm, negative if the line trails to higher
+    columns; `nozzle_column`: the nozzle's column; `columns`: the columns that are measured;
+    `longest_blur_px`: the largest blur of a usable bead; `sign`: 1 for a bead brighter than its ground, -1
+    for a darker one, 0 if unknown; `rotation_deg`: direction of the line, and `tip_px`: the tip (x, y) in px,
+    None if unknown; `mask_px`: the polygon that the nozzle hides; `edge_bias`: pairs in px of a width and by
+    how much wider it looks."""
 
     mm_per_px: float
     nozzle_column: float
@@ -294,16 +299,16 @@ class Mounting(NamedTuple):
     edge_bias: Sequence[tuple[float, float]]
 
     def true_px(self, measured_px: np.ndarray) -> np.ndarray:
-        """Widths in px without the edge bias, straight between the known widths; as measured if calibration
-        found none."""
+        """Returns widths in px without the edge bias, interpolated linearly between the known widths. Without
+        a calibrated bias they are returned as measured."""
         if not self.edge_bias:
             return measured_px
         known_px, bias_px = np.array(self.edge_bias).T
         return measured_px - np.interp(measured_px, known_px + bias_px, bias_px)
 
     def bias_deviation_px(self, width_px: float) -> float:
-        """By how much the edge bias of a width may be off: BETWEEN of what it differs by at the known widths
-        around it; 0 if calibration found none."""
+        """Returns by how much the edge bias of a width may be off: BETWEEN of its difference between the two
+        neighbouring known widths; 0 if calibration found none."""
         if len(self.edge_bias) < 2:
             return 0.0
         known_px, bias_px = np.array(self.edge_bias).T
@@ -312,7 +317,7 @@ class Mounting(NamedTuple):
 
     @property
     def hidden_px(self) -> float:
-        """So much of the line from the tip on is hidden, px: measured columns begin there."""
+        """The hidden length of the line in px, from the tip to the begin of the measured columns."""
         return max(abs(self.columns[0] - self.nozzle_column), 0.0)
 
 
@@ -322,9 +327,9 @@ def pose(
     gantry: Gantry,
     frames: Callable[[Collection[int]], Iterable[tuple[int, np.ndarray]]],
 ) -> tuple[Pose | None, slice]:
-    """How pictures taken at time_s (F,) are turned, and the rows of the turned picture that hold no other
-    line: as the mounting says, else as the frames with a bead, less those without, show it. `frames` gives
-    (number, picture) for some numbers. None: they are measured as they lie."""
+    """Returns how pictures taken at time_s (F,) are turned (None: not at all), and the rows of the turned
+    picture that hold no other line. The pose follows from the mounting, or else from the frames with a bead
+    less those without. `frames` gives (number, picture) for some numbers."""
     along, picture = bead_alone(time_s, gantry, frames)
     if along is None or picture is None:
         return None, slice(0, None)
@@ -337,7 +342,8 @@ def pose(
 
 
 def _turn(mounting: Mounting, picture: np.ndarray) -> Pose | None:
-    """The pose that the mounting says, or that the bead alone (rows, columns) shows."""
+    """Returns the pose from the mounting, or else from the line in a picture of the bead alone (rows,
+    columns)."""
     shape = (picture.shape[0], picture.shape[1])
     if mounting.rotation_deg is not None:
         level = not mounting.rotation_deg and mounting.tip_px is None
@@ -352,9 +358,9 @@ def _turn(mounting: Mounting, picture: np.ndarray) -> Pose | None:
 
 
 def clear_rows(picture: np.ndarray, row: int) -> slice:
-    """The rows around the bead that lies along `row` of a picture (rows, columns) up to most of the gap to
-    the next line on either side, all rows where there is none: a line printed beside it passes for
-    background, or for bead."""
+    """Returns the rows around the bead that lies along `row` of a picture (rows, columns), up to most of the
+    gap to the next line on either side; all rows if there is none. A line printed beside it would be mistaken
+    for background, or for bead."""
     profile = np.median(picture, axis=1).astype(float)
     h, ground = len(profile), float(np.median(profile))
     rise = float(np.median(profile[max(row - 3, 0) : row + 4])) - ground
@@ -373,7 +379,8 @@ def clear_rows(picture: np.ndarray, row: int) -> slice:
 
 
 def pose_of_line(mounting: Mounting, shape: tuple[int, int], found: ImageLine) -> Pose | None:
-    """The pose for a line found in pictures of this shape (rows, columns)."""
+    """Returns the pose for a line found in pictures of this shape (rows, columns); None if the line is level
+    and no tip is known."""
     if mounting.tip_px is not None:
         # the line comes out of the tip and trails to the side that mm_per_px says
         return placed(mounting, shape, found.angle_deg + (180 if mounting.mm_per_px > 0 else 0), found)
@@ -382,9 +389,9 @@ def pose_of_line(mounting: Mounting, shape: tuple[int, int], found: ImageLine) -
 
 
 def placed(mounting: Mounting, shape: tuple[int, int], angle_deg: float, found: ImageLine | None) -> Pose:
-    """The tip comes to lie at the nozzle's column, without a tip the picture's middle stays where it is; the
-    line in the middle row. As many rows as the frame has on both sides of the line over the measured
-    columns."""
+    """Returns the pose that moves the tip to the nozzle's column and the line to the middle row. Without a
+    tip the picture's middle is kept. It has as many rows as the frame has on both sides of the line over the
+    measured columns."""
     h, w = shape
     column = (w - 1) / 2
     x, y = (w - 1) / 2, (h - 1) / 2
@@ -397,7 +404,7 @@ def placed(mounting: Mounting, shape: tuple[int, int], angle_deg: float, found: 
 
 
 def mask(mounting: Mounting, shape: tuple[int, int]) -> np.ndarray | None:
-    """(h, w) bool: the polygon of the picture that the nozzle hides; None if there is none."""
+    """Returns (h, w) bool: the polygon of the picture that the nozzle hides; None if there is none."""
     if len(mounting.mask_px) < 3:
         return None
     hidden = np.zeros(shape, np.uint8)
@@ -408,9 +415,9 @@ def mask(mounting: Mounting, shape: tuple[int, int]) -> np.ndarray | None:
 def bead_alone(
     time_s: np.ndarray, gantry: Gantry, frames: Callable[[Collection[int]], Iterable[tuple[int, np.ndarray]]]
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """The mean (h, w) of some frames in which the gantry moves along, and the same less the mean of some
-    before it moved, about the middle level: nozzle, light and what else rides with the camera are gone. None
-    if it never moves."""
+    """Returns the mean (h, w) of some frames in which the gantry moves along, and the same less the mean of
+    some frames before it moved, about the middle level. The second shows no nozzle, light or other things
+    that move with the camera. Both are None if the gantry never moves."""
     x = np.interp(time_s, *gantry)
     travelled = np.abs(x - x[0]) / max(float(np.ptp(x)), 1e-9)
     before, along = np.flatnonzero(travelled < 1e-3), np.flatnonzero((travelled > 0.2) & (travelled < 0.95))

@@ -1,13 +1,13 @@
-"""What the frames of a trial say before any flow is worked out: the bead's width in every frame, how far off
-it may be, and how late the camera is against the gantry.
+"""Reads the frames of a trial before any flow is computed: the bead's width in every frame, its possible
+error, and the camera's latency against the gantry.
 
-The latency is told from the pictures' own motion: nothing of the extruder enters. What lies on the stage is
-seen by many frames at many columns. With the right latency L all readings of a place
+The latency is found from the motion of the pictures alone, without a model of the extruder. Many frames show
+the same point of the stage at many columns. With the right latency L all readings of a place
 
     s = x(t - L) + (column - nozzle_column) mm_per_px
 
-agree; with a wrong one they part wherever the gantry's speed changes. At an even speed a latency is a shift
-of the stage and is not seen.
+agree. With a wrong one they differ wherever the gantry's speed changes. At constant speed a latency is only a
+shift of the stage and cannot be detected.
 """
 
 import itertools
@@ -45,20 +45,20 @@ LONGEST_CELLS = 1e6
 
 
 class TrialFrames(Protocol):
-    """(time_s, picture) of each frame, in the order of time; walked as often as needed."""
+    """(time_s, picture) of each frame, in the order of time. It can be iterated as often as needed."""
 
     time_s: np.ndarray
 
     def __iter__(self) -> Iterator[tuple[float, np.ndarray]]: ...
 
     def pick(self, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
-        """(number, picture) of those with these numbers."""
+        """Yields (number, picture) of the frames with these numbers."""
         ...
 
 
 class Latency(NamedTuple):
-    """latency_s: the frames are so much later than their stamps say; deviation_s its standard deviation,
-    infinite where the pictures do not tell."""
+    """latency_s: by how much the frames are later than their stamps; deviation_s: its standard deviation,
+    infinite if the pictures do not show it."""
 
     latency_s: float
     deviation_s: float
@@ -70,10 +70,10 @@ KNOWN_S = 0.005
 
 
 class Readings(NamedTuple):
-    """The readings of F frames: time_s (F,) as stamped, columns (m,), widths (F, m) in px of the picture as
-    it is measured (0 bare, NaN unread), reasons (F,) why a frame has no usable bead, the camera's latency as
-    this recording tells it, and by how much all widths may be off for blur and contrast, px (NaN without a
-    bead)."""
+    """The readings of F frames. `time_s` (F,) as stamped; `columns` (m,); `widths` (F, m) in px of the
+    picture as it is measured (0 bare, NaN unread); `reasons` (F,): why a frame has no usable bead; `latency`:
+    the camera's latency from this recording; `edge_px`: by how much all widths may be off because of blur and
+    contrast (NaN without a bead)."""
 
     time_s: np.ndarray
     columns: np.ndarray
@@ -84,7 +84,7 @@ class Readings(NamedTuple):
 
     @classmethod
     def from_values(cls, values: tuple) -> "Readings":
-        """Of six plain values, the latency as (latency_s, deviation_s)."""
+        """Makes readings from six plain values, the latency as (latency_s, deviation_s)."""
         *rest, late, edge_px = values
         return cls(*rest, Latency(*late), edge_px)
 
@@ -92,8 +92,8 @@ class Readings(NamedTuple):
 def measure_beads(
     frames: TrialFrames, gantry: Gantry, mounting: Mounting
 ) -> Iterator[tuple[float, np.ndarray, Bead]]:
-    """(time, picture as it is measured, bead) of each frame, a few at a time: memory stays flat, and what a
-    frame costs beyond its decoding is shared."""
+    """Yields (time, picture as it is measured, bead) of each frame. A few frames are measured at a time, so
+    that memory is bounded and the cost beyond decoding is shared."""
     turn, rows = pose(mounting, frames.time_s, gantry, frames.pick)
     rest = iter(frames)
     while batch := list(itertools.islice(rest, TOGETHER)):
@@ -110,8 +110,8 @@ def measure_beads(
 
 
 def consistent(beads: Sequence[Bead]) -> list[Bead]:
-    """The beads of one recording; those far more blurred or fainter than most of them, or of the other
-    colour, come back with a reason: grain of an empty bed passes for a bead now and then."""
+    """Returns the beads of one recording. Beads far more blurred or fainter than most, or of the other
+    colour, get a reason, because grain of an empty bed is sometimes mistaken for a bead."""
     blur, contrast = _typical(beads)
     return [
         one
@@ -122,14 +122,14 @@ def consistent(beads: Sequence[Bead]) -> list[Bead]:
 
 
 def _typical(beads: Sequence[Bead]) -> tuple[float, float]:
-    """Median blur in px and contrast of the usable beads; NaN without one."""
+    """Returns median blur in px and contrast of the usable beads; NaN without one."""
     usable = [(one.blur_px, one.contrast) for one in beads if not one.reason]
     blur, contrast = np.median(usable, axis=0) if usable else (np.nan, np.nan)
     return float(blur), float(contrast)
 
 
 def read(frames: TrialFrames, gantry: Gantry, mounting: Mounting) -> Readings:
-    """The readings of a trial's frames; `gantry` is its place as recorded."""
+    """Returns the readings of a trial's frames. `gantry` is its place as recorded."""
     first, last = mounting.columns
     bands = (max((last - first) // STEP_PX, 1), BANDS)
     times, beads, signals = [], [], []
@@ -163,7 +163,7 @@ def _latency(
 
 
 def near_changes(time_s: np.ndarray, gantry: Gantry) -> np.ndarray:
-    """(F,) bool: whether the gantry's speed changes near a frame."""
+    """Returns (F,) bool: whether the gantry's speed changes near a frame."""
     clock, position = gantry
     speed = np.abs(np.gradient(position, clock))
     top = float(speed.max())
@@ -177,9 +177,9 @@ def near_changes(time_s: np.ndarray, gantry: Gantry) -> np.ndarray:
 
 
 def estimate_latency(time_s: np.ndarray, signals: np.ndarray, gantry: Gantry, *, step_mm: float) -> Latency:
-    """The latency of F frames taken at time_s (F,), of which signals (F, bands, n) are gray levels in bands
-    along the line, each of the n readings `step_mm` further along the stage than the one before (negative
-    where the line trails to higher columns)."""
+    """Estimates the latency of F frames taken at time_s (F,). signals (F, bands, n) are gray levels in bands
+    along the line; each of the n readings lies `step_mm` further along the stage than the one before
+    (negative if the line trails to higher columns). Returns UNTOLD if the frames do not show the latency."""
     used = near_changes(time_s, gantry)
     values = np.asarray(signals, np.float64)[used]
     if len(values) < 8:
@@ -218,7 +218,7 @@ def estimate_latency(time_s: np.ndarray, signals: np.ndarray, gantry: Gantry, *,
 
 
 def _disagreement(place: np.ndarray, values: np.ndarray) -> float:
-    """Sum of squares of values (F, bands, n) about the mean of their places (F, n), in cells."""
+    """Returns the sum of squares of values (F, bands, n) about the mean of their places (F, n), in cells."""
     low = np.floor(place).astype(int)
     share = (place - low).ravel()
     low = (low - low.min()).ravel()
@@ -234,8 +234,8 @@ def _disagreement(place: np.ndarray, values: np.ndarray) -> float:
 
 
 def pool_latencies(estimates: Sequence[Latency]) -> Latency:
-    """The latency of one camera from that of several recordings, each weighted by its certainty; the
-    deviation is what they scatter where that is more than they say."""
+    """Returns the latency of one camera from those of several recordings, each weighted by its certainty. The
+    deviation is the scatter of these latencies if that is larger than their own deviations explain."""
     told = [one for one in estimates if math.isfinite(one.deviation_s)]
     if not told:
         return UNTOLD
@@ -247,7 +247,8 @@ def pool_latencies(estimates: Sequence[Latency]) -> Latency:
 
 
 def latency_of_camera(latency_s: float | None, estimates: Sequence[Latency]) -> Latency:
-    """The latency that is taken off: as given, or as the recordings together tell it to KNOWN_S."""
+    """Returns the latency used for the correction: `latency_s` if given, else the pooled one of the
+    recordings if it is known to KNOWN_S, else UNTOLD."""
     if latency_s is not None:
         return Latency(latency_s, 0.0)
     together = pool_latencies(estimates)

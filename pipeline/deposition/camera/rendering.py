@@ -1,5 +1,5 @@
-"""Synthetic frames of a trial: flow and gantry position -> deposited cross-section -> what a camera beside
-the nozzle sees, with everything that misleads an edge detector."""
+"""Synthetic frames of a trial: flow and gantry position -> deposited cross-section -> the picture of a camera
+beside the nozzle, with everything that misleads an edge detector."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,15 +24,15 @@ INSTANTS = 20
 
 
 class Scene(NamedTuple):
-    """What the camera sees. Levels are gray levels of 0..255, px are pixels, shares are of the bead's
-    half-width; `contrast` below 0 is a dark bead.
+    """What the camera shows. Levels are gray levels of 0..255, px are pixels, shares are of the bead's
+    half-width. A `contrast` below 0 is a dark bead.
 
     Shading: the bead's level falls as 1 - shading rho^2, rho = 2 y / w across the bead. The specular line
     lies at `specular_at` = rho, `specular_px` wide (one standard deviation), `specular` levels above the
     bead. `blur_px` is the standard deviation of the point spread. Glare is a bump of `glare` levels. The
     texture (standard deviation, grain in px) lies on the stage, moves with it and is covered by the bead;
-    noise is new in every frame. The bead's edges wander by `roughness_px` about their truth, and stay so.
-    `tilt_deg` turns the line, `offset_px` moves it off the middle.
+    noise is new in every frame. The bead's edges deviate by `roughness_px` from their true place, in the same
+    way in every frame. `tilt_deg` turns the line, `offset_px` shifts it from the middle.
     """
 
     height: int
@@ -61,8 +61,8 @@ SCENES = {"nominal": NOMINAL, "hard": HARD}
 
 
 class SimulatedCamera:
-    """Renders frames of one scene; it remembers its tables and its banks
-    of noise and texture. A frame takes about 0.3 ms."""
+    """Renders frames of one scene. It keeps its tables and its banks of noise and texture. A frame takes
+    about 0.3 ms."""
 
     def __init__(self, scene: Scene, rng: np.random.Generator):
         self.scene, self.rng = scene, rng
@@ -94,10 +94,10 @@ class SimulatedCamera:
         )
 
     def frame(self, width_px: np.ndarray | float, *, stage_px: int) -> np.ndarray:
-        """(h, w) uint8 with a bead width_px (w,) wide, 0 where there is none; the stage has moved by stage_px
-        columns, and what lies on it with it.
+        """Returns (h, w) uint8 with a bead width_px (w,) wide, 0 for no bead. The stage, with everything on
+        it, has moved by stage_px columns.
 
-        Wider beads than the frame is high are drawn as wide as the frame.
+        Beads wider than the frame is high are drawn as wide as the frame.
         """
         scene, rng = self.scene, self.rng
         h, w = scene.height, scene.width
@@ -120,7 +120,7 @@ class SimulatedCamera:
         return cv2.transpose(noisy)
 
     def empty(self, *, stage_px: int) -> np.ndarray:
-        """A frame without a bead."""
+        """Returns a frame without a bead."""
         return self.frame(0.0, stage_px=stage_px)
 
     def trial(
@@ -134,11 +134,11 @@ class SimulatedCamera:
         nozzle_mm: tuple[float, float],
         contact_angle_deg: float,
     ) -> Iterator[tuple[float, np.ndarray]]:
-        """(time, frame) of a trial, one by one: flow (T,) mm^3/s and position (T,) mm, both straight between
-        samples; nozzle_mm are its inner and outer radius.
+        """Yields (time, frame) of a trial, one by one. flow (T,) in mm^3/s and position (T,) in mm are linear
+        between samples; nozzle_mm are its inner and outer radius.
 
-        The bead under the nozzle grows while the frames run: each instant adds Q dt times the footprint to
-        the section A(s), and the width is sqrt(A / c).
+        The bead under the nozzle grows from frame to frame: each instant adds Q dt times the footprint to the
+        section A(s), and the width is sqrt(A / c).
         """
         c = area(1.0, contact_angle_deg)
         px = abs(view.mm_per_px)
@@ -163,7 +163,7 @@ class SimulatedCamera:
             yield float(t), frame
 
     def _nozzle(self, view: View, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns that the nozzle's tip hides."""
+        """Returns rows and columns that the nozzle's tip hides."""
         y, x = np.ogrid[: self.scene.height, : self.scene.width]
         middle = self.scene.height / 2 - 0.5 + self.scene.offset_px
         return np.nonzero((y - middle) ** 2 + (x - view.nozzle_column) ** 2 < radius_px**2)
@@ -172,7 +172,8 @@ class SimulatedCamera:
 def calibrate(
     camera: SimulatedCamera, known_widths_mm: Sequence[float], rng: np.random.Generator, mounting: Mounting
 ) -> bead.WidthCalibration:
-    """Pixels to mm on pictures of beads of known widths. Raises ValueError if one cannot be measured."""
+    """Calibrates pixels to mm on pictures of beads of known widths. Raises ValueError if one cannot be
+    measured."""
     widths_mm = np.repeat(known_widths_mm, CALIBRATION_FRAMES)
     px, columns, blur_px = abs(mounting.mm_per_px), mounting.columns, mounting.longest_blur_px
     frames = [camera.frame(width / px, stage_px=int(rng.integers(0, 10_000))) for width in widths_mm]
@@ -191,7 +192,7 @@ def calibrate(
 
 
 def _instants(begin, end, time_s, flow, position) -> tuple[np.ndarray, np.ndarray]:
-    """Volumes (mm^3) and places (mm) of the instants between two frames."""
+    """Returns volumes (mm^3) and places (mm) of the instants between two frames."""
     dt = (end - begin) / INSTANTS
     at = begin + dt * (np.arange(INSTANTS) + 0.5)
     return np.interp(at, time_s, flow) * dt, np.interp(at, time_s, position)
@@ -200,7 +201,8 @@ def _instants(begin, end, time_s, flow, position) -> tuple[np.ndarray, np.ndarra
 def _lay(
     A: np.ndarray, origin: float, px: float, volumes: np.ndarray, places: np.ndarray, inner: float
 ) -> None:
-    """A += sum of volumes times the footprint at their places, as means over the cells of the stage."""
+    """Adds to A the sum of volumes times the footprint at their places, as means over the cells of the
+    stage."""
     first = int((places.min() - inner - origin) / px)
     last = int((places.max() + inner - origin) / px) + 2
     faces = origin + px * (np.arange(first, last + 1) - 0.5)
@@ -208,11 +210,11 @@ def _lay(
 
 
 def _tables(scene: Scene, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Two tables (widths, shifts, rows) int16 for widths of 0 to the frame's height: the bead's profile less
-    background, and 64 times the share of substrate still seen.
+    """Returns two tables (widths, shifts, rows) int16 for widths of 0 to the frame's height: the bead's
+    profile less background, and 64 times the share of substrate that is still visible.
 
-    The bead's middle is at row (rows - 1) / 2 + shift / SHIFTS. Drawn on SHIFTS
-    samples a row, blurred, then averaged over each pixel.
+    The bead's middle is at row (rows - 1) / 2 + shift / SHIFTS. It is drawn on SHIFTS samples per row,
+    blurred, then averaged over each pixel.
     """
     widths = np.arange(0.0, scene.height, WIDTH_STEP, dtype=np.float32)
     fine = SHIFTS * (rows + 1)
@@ -237,7 +239,7 @@ def _tables(scene: Scene, rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _light(scene: Scene, rng: np.random.Generator) -> np.ndarray:
-    """(w, h) int16: background with a glare bump at a drawn place."""
+    """Returns (w, h) int16: background with a glare bump at a random place."""
     h, w = scene.height, scene.width
     x, y = np.ogrid[:w, :h]
     at_x, at_y, spread = rng.uniform(0, w), rng.uniform(0, h), 0.3 * w
@@ -251,7 +253,7 @@ def _bank(rng: np.random.Generator, size: int, deviation: float) -> np.ndarray:
 
 
 def _texture(rng: np.random.Generator, length: int, h: int, scene: Scene) -> np.ndarray:
-    """(length, h) int16 of the given grain and deviation."""
+    """Returns a texture (length, h) int16 of the given grain and deviation."""
     t = cv2.GaussianBlur(rng.standard_normal((length, h), dtype=np.float32), (0, 0), scene.grain_px)
     return np.rint(scene.texture / t.std() * t).astype(np.int16)
 
@@ -276,11 +278,11 @@ def simulate_trial(
     nozzle_mm: tuple[float, float],
     contact_angle_deg: float,
 ) -> tuple[Iterator[tuple[float, np.ndarray]], np.ndarray, np.ndarray]:
-    """Runs the command u (T,) in mm: (time, picture) of each frame, the command (T,) as the drive applied it,
-    and the true flow (T,) in mm^3/s.
+    """Runs the command u (T,) in mm. Returns (time, picture) of each frame, the command (T,) as the drive
+    applied it, and the true flow (T,) in mm^3/s.
 
-    The camera sees that flow with what does not repeat from trial to trial, `noise` by `extruder.disturb`; a
-    law is judged by the true flow alone. nozzle_mm are the inner and the outer radius.
+    The camera sees that flow with the disturbances that do not repeat from trial to trial, `noise` by
+    `extruder.disturb`; a law is judged by the true flow alone. nozzle_mm are the inner and the outer radius.
     """
     truth = flow(plant, u, sample_time_s=sample_time_s, drive=drive)
     laid = np.maximum(disturb(truth, rng, steady_flow=routine.r.max(), **noise), 0.0)

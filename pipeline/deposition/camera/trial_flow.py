@@ -1,5 +1,5 @@
-"""A trial measured from its pictures: readings of its frames and signals of its recording -> the flow that a
-law learns from, on the clock of its routine."""
+"""Measures a trial from its pictures: readings of its frames and signals of its recording -> the flow that a
+law learns from, at the times of its routine."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -27,9 +27,9 @@ CALIBRATED_PX, UNCALIBRATED_PX = 0.2, 0.4
 
 
 class MeasuredTrial(NamedTuple):
-    """One trial measured from its frames: the trial as a law sees it, the flow with its uncertainty, the
-    number of frames, frames without a usable bead by reason, and the camera's latency: as these frames tell
-    it, and as it was corrected."""
+    """One trial measured from its frames. `trial`: as a law gets it; `flow`: with its uncertainty; `frames`:
+    number of frames; `rejected`: number of frames without a usable bead, by reason; `latency`: the camera's
+    latency from these frames; `of_camera`: the latency used for the correction."""
 
     trial: Trial
     flow: flow.Flow
@@ -52,10 +52,10 @@ def measure_trial(
     contact_angle_deg: float,
     width_deviation_mm: float,
 ) -> MeasuredTrial:
-    """The trial of one recording: readings of its frames, and signals {name: (time_s (n,), values (n,))} on
-    clocks of their own. scale is (px_per_mm, offset_px) of the widths. Raises ValueError if no frame shows a
-    bead, if most of those that show the line have none, if the stage ahead of the line is not bare, if the
-    camera looks askew, and for signals that do not cover the routine."""
+    """Returns the trial of one recording, from the readings of its frames and signals {name: (time_s (n,),
+    values (n,))}, each with times of its own. scale is (px_per_mm, offset_px) of the widths. Raises
+    ValueError if no frame shows a bead, if most frames that show the line have no usable bead, if the stage
+    ahead of the line is not bare, if the camera looks askew, and if signals do not cover the routine."""
     px_per_mm, offset_px = scale
     widths_mm = (mounting.true_px(readings.widths) - offset_px) / px_per_mm
     widths_mm = np.where(readings.widths == 0, 0.0, widths_mm)
@@ -95,7 +95,7 @@ def measure_trial(
 
 
 def counts(reasons: Sequence[str]) -> dict[str, int]:
-    """How many frames have no usable bead, by reason."""
+    """Returns the number of frames without a usable bead, by reason."""
     return {reason: list(reasons).count(reason) for reason in dict.fromkeys(reasons) if reason}
 
 
@@ -112,8 +112,8 @@ def _check_beads(readings: Readings) -> None:
 
 
 def _check_bare(widths_mm: np.ndarray, before: np.ndarray) -> None:
-    """Raises ValueError if most of the widths (F, m) of the frames `before` (F,) the line are those of a bead
-    as wide as half the line or more: then it is no line that is measured."""
+    """Raises ValueError if most of the widths (F, m) in the frames `before` (F,) the line are at least half
+    as wide as the line, because then the bead that is measured is not the line."""
     usual_mm, bare = float(np.median(widths_mm[widths_mm > 0])), widths_mm[before]
     share = float(np.mean(bare > usual_mm / 2)) if before.any() else 0.0
     if share > REJECTED:
@@ -137,8 +137,8 @@ def _check_askew(trend: float) -> None:
 
 
 def _check_rejected(reasons: np.ndarray) -> None:
-    """Raises ValueError if most of the frames that show the line have one of the `reasons` (F,) why they have
-    no usable bead."""
+    """Raises ValueError if most of the frames that show the line have no usable bead. `reasons` (F,): why, ""
+    for a usable bead."""
     rejected = counts(reasons.tolist())
     share = sum(rejected.values()) / max(len(reasons), 1)
     if share > REJECTED:
@@ -153,8 +153,8 @@ def _check_rejected(reasons: np.ndarray) -> None:
 def on_routine_clock(
     signals: Mapping[str, tuple[np.ndarray, np.ndarray]], routine: Routine
 ) -> dict[str, np.ndarray]:
-    """The signals (T,) of a recording at the samples of its routine. Raises ValueError if the recording is
-    too short, has gaps, or shows another travel."""
+    """Returns the signals (T,) of a recording at the samples of its routine. Raises ValueError if the
+    recording is too short, has gaps, or shows another travel."""
     for name, (time_s, _) in signals.items():
         if len(time_s) == 0 or time_s[0] > SLACK_S or time_s[-1] < routine.time_s[-1] - SLACK_S:
             span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s" if len(time_s) else "nothing"
@@ -179,12 +179,12 @@ def on_routine_clock(
 
 
 def clock_shift(time_s: np.ndarray, position: np.ndarray, routine: Routine) -> float:
-    """How much later than its routine a recording's clock runs, in s: the shift with the least
+    """Returns by how many s a recording's clock is later than its routine's: the shift with the least
 
         sum_t (|v(t)| - v_routine(t))^2
 
-    of the gantry's speed v; 0 for a record shorter than the routine. A recorder begins before the routine
-    does, and a clock of the calendar is counted from its whole second.
+    of the gantry's speed v; 0 if the record is shorter than the routine. A recorder starts before the routine
+    does, and a calendar clock counts from its whole second.
     """
     Ts = float(routine.time_s[1] - routine.time_s[0])
     spare = round(SLACK_S / Ts)
@@ -201,8 +201,9 @@ def clock_shift(time_s: np.ndarray, position: np.ndarray, routine: Routine) -> f
 
 
 def latency_figures(measured: Sequence[MeasuredTrial]) -> dict[str, float | None]:
-    """How late the camera is, as it was corrected in the last trial, and its standard deviation, s; None if
-    the pictures do not tell it: then flow near corners and pauses may err by all of it."""
+    """Returns the camera's latency as corrected in the last trial, and its standard deviation, in s. Both are
+    None if the pictures do not show it; then the flow near corners and pauses may be off by the whole
+    latency."""
     last = measured[-1].of_camera
     known = np.isfinite(last.deviation_s)
     return {
@@ -212,8 +213,8 @@ def latency_figures(measured: Sequence[MeasuredTrial]) -> dict[str, float | None
 
 
 def flow_errors(measured: Sequence[MeasuredTrial], routine: Routine) -> dict[str, float]:
-    """How well pictures measure the flow, over all trials: r.m.s. error in % of the steady flow, in the
-    whole trial and around its pause, and frames without a bead."""
+    """Returns how well pictures measure the flow, over all trials: r.m.s. error in % of the steady flow, in
+    the whole trial and around its pause, and the share of frames without a bead in %."""
     errors = np.array([one.flow.flow - one.trial.truth for one in measured]) / routine.r.max()
     near = (routine.time_s > routine.pause_s[0] - 0.3) & (routine.time_s < routine.pause_s[1] + 0.3)
     trial, corner = (100 * np.sqrt(np.mean(part**2, axis=1)) for part in (errors, errors[:, near]))
@@ -227,7 +228,8 @@ def flow_errors(measured: Sequence[MeasuredTrial], routine: Routine) -> dict[str
 
 
 def filmed_rows(measured: Mapping[tuple[str, int], Sequence[MeasuredTrial]]) -> dict[str, list]:
-    """Columns of filmed.parquet: one row a measured trial, by (material, number of the routine)."""
+    """Returns the columns of filmed.parquet: one row per measured trial, by (material, number of the
+    routine)."""
     names = ("material", "routine", "trial", "frames", "rejected", "reasons")
     names += ("deviation_mm3_per_s", "observable", "outliers")
     rows = [

@@ -1,5 +1,6 @@
-"""What a machine answers to, from its first trials: a pressure, the speed of what is pushed, or its place.
-Each kind is fitted to the command as it was sent; the kind with the least error names the machine."""
+"""Finds from its first trials what a machine responds to: a pressure, the speed of what is pushed, or its
+place. Each kind is fitted to the command as it was sent; the machine's kind is the one with the least
+error."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -34,7 +35,7 @@ Response = Callable[[np.ndarray, float, float, float, float], np.ndarray]
 
 
 def relaxing(w: np.ndarray, tau: float, yield_: float, exponent: float, _: float) -> np.ndarray:
-    """Flow (T,) over the steady one under a pressure w (T,) that is given, tau in samples:
+    """Returns the flow (T,), divided by the steady one, for a given pressure w (T,), with tau in samples:
 
     tau x' = w - x,   q = max(x - yield, 0)^exponent
     """
@@ -43,10 +44,10 @@ def relaxing(w: np.ndarray, tau: float, yield_: float, exponent: float, _: float
 
 
 def conserving(w: np.ndarray, tau: float, yield_: float, exponent: float, leak: float) -> np.ndarray:
-    """Flow (T,) over the steady one under the volume w (T,) that is pushed, of which what does not come out
-    stays as pressure x; tau in samples:
+    """Returns the flow (T,), divided by the steady one, for the pushed volume w (T,). Volume that does not
+    come out remains as pressure x; tau in samples:
 
-    tau x' = w (1 - leak max(x, 0)) - q,   q = max(x - yield, 0)^exponent
+        tau x' = w (1 - leak max(x, 0)) - q,   q = max(x - yield, 0)^exponent
     """
     x, out = 0.0, []
     for pushed in w.tolist():
@@ -62,10 +63,10 @@ def errors(
     sent: Sequence[np.ndarray], y: Sequence[np.ndarray], r: Sequence[np.ndarray], *, gain: float,
     time_constant_s: float, sample_time_s: float,
 ) -> dict[CommandKind, float]:  # fmt: skip
-    """The share that each kind, fitted to all trials, leaves of the sum of squares of their flows. Of each
-    trial: what was sent (T,), in mm or mm/s, measured flow y (T,) and wanted r (T,) in mm^3/s. Flows above
-    MOST count as MOST. gain and time_constant_s are what is known beforehand. Two speeds part the kinds
-    better than one."""
+    """Returns the share of the flows' sum of squares that each kind, fitted to all trials, does not explain.
+    Each trial has: the sent command (T,), in mm or mm/s, measured flow y (T,) and wanted r (T,) in mm^3/s.
+    Flows above MOST count as MOST. gain and time_constant_s are the values known beforehand. Two speeds
+    separate the kinds better than one."""
     steady, slow = max(float(one.max()) for one in r), math.log(time_constant_s / sample_time_s)
     observable = [np.isfinite(flow) for flow in y]
     told = [np.minimum(flow[mask] / steady, MOST) for flow, mask in zip(y, observable, strict=True)]
@@ -104,12 +105,12 @@ def errors(
 
 
 def wrong_kind(squares: dict[CommandKind, float], declared: CommandKind) -> tuple[str, bool]:
-    """The sentence that names the kind of the machine if it is another than the declared one, else ""; and
-    whether nothing can be learned by the declared one.
+    """Returns the sentence that names the kind of the machine if it differs from the declared one, else "";
+    and whether nothing can be learned with the declared one.
 
-    A pressure and a speed both give a steady flow for a steady command. They differ by what the ink's yield
-    and its thinning do, so that a machine without either fits both, and neither is named wrong. A command
-    sent as a place hardly parts them.
+    A pressure and a speed both give a steady flow for a steady command. They differ only by the effects of
+    the ink's yield and its thinning. A machine without these effects fits both kinds, and neither is reported
+    as wrong. A command sent as a place hardly separates them.
     """
     best = min(KINDS, key=squares.__getitem__)
     places = "place" in (declared, best)

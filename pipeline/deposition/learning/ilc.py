@@ -1,6 +1,7 @@
 """Iterative learning control of the flow: the paper's law (Hoelzle 2009, eq. 2), the inverse of the
-identified model averaged over trials, the convergence test before anything runs, what the limits of the drive
-allow, and the learning loop, which rolls back, and restarts on a machine that changed."""
+identified model averaged over trials, the convergence test before anything runs, the limits of the drive, and
+the learning loop. The loop goes back to the best command after a bad trial, and restarts if the machine
+changed."""
 
 import functools
 import math
@@ -48,8 +49,8 @@ YIELD_LEAD_S = 0.4
 
 
 class Trial(NamedTuple):
-    """Command u (T,) in mm as the drive applied it, measured flow y (T,) in mm^3/s with NaN where it was not
-    observable, true flow if simulated."""
+    """One trial: command u (T,) in mm as the drive applied it; measured flow y (T,) in mm^3/s, NaN where it
+    was not observable; true flow (T,) if simulated, else None."""
 
     u: np.ndarray
     y: np.ndarray
@@ -92,8 +93,8 @@ def _butterworth(order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarr
 
 
 def zero_phase(x: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
-    """Q x (..., T): Butterworth low-pass of `order` run forward and backward, |Q|^2 without phase; x is zero
-    before and after, as no-flow is."""
+    """Returns Q x (..., T). The Butterworth low-pass of `order` runs forward and backward, which gives |Q|^2
+    without phase. x counts as zero before and after, because there is no flow then."""
     sos, pad = _butterworth(order, cutoff_hz, sample_time_s), round(order / cutoff_hz / sample_time_s)
     padded = np.zeros((*x.shape[:-1], x.shape[-1] + 2 * pad))
     padded[..., pad : padded.shape[-1] - pad] = x
@@ -103,7 +104,8 @@ def zero_phase(x: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: fl
 
 
 def magnitude(frequency_hz: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
-    """|Q(f)| (F,) of one run of the Butterworth filter; squared it is the response of `zero_phase`."""
+    """Returns |Q(f)| (F,) of one run of the Butterworth filter. Its square is the response of
+    `zero_phase`."""
     sos = _butterworth(order, cutoff_hz, sample_time_s)
     return np.abs(scipy.signal.sosfreqz(sos, frequency_hz, fs=1 / sample_time_s)[1])
 
@@ -123,8 +125,8 @@ def _slow_inverse(
 def hoelzle_filter(
     frequency_hz: np.ndarray, model: Extruder, settings: HoelzleSettings, *, sample_time_s: float
 ) -> np.ndarray:
-    """L(f) = k_p / P̂ (F,), P̂ = K (fast_zero s + 1) / (tau s + 1): the fast zero makes the inverse proper
-    (Hoelzle 2009, eq. 2); bilinear."""
+    """Returns L(f) = k_p / P̂ (F,), with P̂ = K (fast_zero s + 1) / (tau s + 1), by the bilinear transform
+    (Hoelzle 2009, eq. 2). The fast zero makes the inverse proper."""
     return scipy.signal.freqz(
         *_slow_inverse(model, settings, sample_time_s), frequency_hz, fs=1 / sample_time_s
     )[1]
@@ -139,13 +141,13 @@ def hoelzle_law(
     drive: Drive,
     sample_time_s: float,
 ) -> Law:
-    """The paper's law on the last trial (Hoelzle 2009, eq. 2); q is `zero_phase` or takes the same, the model
-    the nominal (1).
+    """Returns the paper's law on the last trial (Hoelzle 2009, eq. 2). `q` is `zero_phase` or a function with
+    the same arguments; `model` is the nominal model (1).
 
         u_{j+1} = Q (u_j + L e_j)
 
-    u_j is what the drive applied, so that nothing winds up at its limits; e_j = 0 where the flow was not
-    observable.
+    u_j is the command that the drive applied, so nothing winds up at its limits. e_j = 0 where the flow was
+    not observable.
     """
     b, a = _slow_inverse(model, settings, sample_time_s)
 
@@ -164,14 +166,15 @@ def hoelzle_law(
 
 
 def inverse_filter(frequency_hz: np.ndarray, model: Extruder, *, sample_time_s: float) -> np.ndarray:
-    """L(f) = conj(H) / (|H|^2 + eps) (F,), H the response of the identified model with its delay."""
+    """Returns L(f) = conj(H) / (|H|^2 + eps) (F,). H is the response of the identified model with its
+    delay."""
     H = frequency_response(model, frequency_hz, sample_time_s=sample_time_s)
     return np.conj(H) / (np.abs(H) ** 2 + EPSILON * model.gain**2)
 
 
 def inverse(x: np.ndarray, model: Extruder, *, sample_time_s: float) -> np.ndarray:
-    """L x (T,) by FFT, with zeros for as long as the model's delay and
-    a second more, so that nothing comes round."""
+    """Returns L x (T,) by FFT. x is padded with zeros for the model's delay and one second more, so that
+    nothing wraps around."""
     n = scipy.fft.next_fast_len(len(x) + round((model.delay_s + 1.0) / sample_time_s), real=True)
     f = np.fft.rfftfreq(n, sample_time_s)
     return np.fft.irfft(np.fft.rfft(x, n) * inverse_filter(f, model, sample_time_s=sample_time_s), n)[
@@ -180,18 +183,19 @@ def inverse(x: np.ndarray, model: Extruder, *, sample_time_s: float) -> np.ndarr
 
 
 def known_share(frequency_hz: np.ndarray, model: Extruder) -> np.ndarray:
-    """T(f) (F,) = 1 / (1 + (|lag|^-4 - 1) / LAG_INVERSE^4), |lag(f)|^2 = 1 / (1 + (f / lag_hz)^4): what is
-    kept of Q where the inverse of the model's lag amplifies. One half where it does so by LAG_INVERSE; 1 of a
-    model without a lag.
+    """Returns T(f) (F,), the share of Q that is kept if the inverse of the model's lag amplifies.
 
-    A lag of few Hz is hardly identified beyond its own frequency, and stands for lags of another order; its
-    inverse would amplify noise without end, and diverge where |Q (1 - L P)| > 1.
+        T(f) = 1 / (1 + (|lag(f)|^-4 - 1) / LAG_INVERSE^4),   |lag(f)|^2 = 1 / (1 + (f / lag_hz)^4)
+
+    T is one half where the inverse amplifies by LAG_INVERSE, and 1 for a model without a lag. A lag of a few
+    Hz is hardly identified beyond its own frequency, and may stand for lags of another order. Its inverse
+    would amplify noise without limit, and learning would diverge where |Q (1 - L P)| > 1.
     """
     return 1 / (1 + ((1 + (frequency_hz / model.lag_hz) ** 4) ** 2 - 1) / LAG_INVERSE**4)
 
 
 def known(x: np.ndarray, model: Extruder, *, sample_time_s: float) -> np.ndarray:
-    """T x (..., T) without phase (`known_share`)."""
+    """Returns T x (..., T) without phase (`known_share`)."""
     if math.isinf(model.lag_hz):
         return x
     n = scipy.fft.next_fast_len(x.shape[-1] + round(1 / sample_time_s), real=True)
@@ -200,10 +204,11 @@ def known(x: np.ndarray, model: Extruder, *, sample_time_s: float) -> np.ndarray
 
 
 def bounded(x: np.ndarray, learned: np.ndarray, *, sample_time_s: float) -> np.ndarray:
-    """`learned` (T,) with at no frequency more than MOST times the amplitude of x (T,), both summed over the
-    SMOOTHED_HZ around it; as it is where it has nowhere more.
+    """Returns `learned` (T,), limited at each frequency to MOST times the amplitude of x (T,). Both
+    amplitudes are summed over SMOOTHED_HZ around that frequency. If `learned` exceeds the limit at no
+    frequency, it is unchanged.
 
-    So no command grows without bound, whatever the machine is: |u| <= MOST |L Q x|, and L Q is known.
+    So no command grows without limit on any machine, because |u| <= MOST |L Q x|, and L Q is known.
     """
     n = scipy.fft.next_fast_len(len(x) + round(1 / sample_time_s), real=True)
     spectra = np.fft.rfft([x, learned], n)
@@ -215,8 +220,8 @@ def bounded(x: np.ndarray, learned: np.ndarray, *, sample_time_s: float) -> np.n
 
 
 def wanted(r: np.ndarray, yield_: float, *, sample_time_s: float) -> np.ndarray:
-    """x (T,) in mm^3/s that gives the flow r: r + yield while ink is wanted, brought up to the yield just
-    before and let down just after; r, yield in mm^3/s."""
+    """Returns x (T,) in mm^3/s that gives the flow r: r + yield while flow is wanted. x rises to the yield
+    just before and falls just after. r and yield are in mm^3/s."""
     half = round(YIELD_LEAD_S / sample_time_s)
     near = np.convolve(r > 0, np.ones(2 * half + 1), "full")[half : half + len(r)] / (half + 1)
     return r + yield_ * np.where(r > 0, 1.0, np.minimum(near, 1.0))
@@ -225,8 +230,8 @@ def wanted(r: np.ndarray, yield_: float, *, sample_time_s: float) -> np.ndarray:
 def command(
     x: np.ndarray, r: np.ndarray, model: Extruder, *, drive: Drive, sample_time_s: float
 ) -> np.ndarray:
-    """u (T,) in mm that presses x (T,) out of the model; where the drive cannot follow that, the u whose flow
-    comes nearest (`reachable.nearest`)."""
+    """Returns u (T,) in mm for which the model gives x (T,). If the drive cannot follow it, returns the u
+    with the nearest flow (`reachable.nearest`)."""
     u = inverse(x, model, sample_time_s=sample_time_s)
     if follows(u, drive, sample_time_s=sample_time_s):
         return u
@@ -248,21 +253,21 @@ def command(
 
 
 class InverseLaw:
-    """The model inverse over the trials i <= j that it is given, L the inverse of the model identified from
-    the first of them; it remembers that model.
+    """The law by model inverse over the trials i <= j that it gets. L is the inverse of the model identified
+    from the first of them; the law remembers that model.
 
         u_{j+1} = Q sum_i w_i (u_i + L e_i)
                 = L Q ((r + yield) / g - d)
 
-    The second line, with the average d of what the model misses, is the same if the gain g of the next trial
-    is 1; for one trial both are Q (u + L e). The weights w_i average what does not repeat, and follow what
-    changes (`trial_filter.repeating`); Q stays outside, so that it erodes nothing as they fall, and |1 - k +
-    k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k. Q ends earlier if the model's lag would have
-    to be inverted far above its frequency (`known_share`), and what is learned is bounded by what the model
-    alone asks for (`bounded`).
+    In the second line d is the average of what the model misses. Both lines are equal if the gain g of the
+    next trial is 1; for one trial both are Q (u + L e). The weights w_i average what does not repeat, and
+    follow what changes (`trial_filter.repeating`). Q is outside the sum, so falling weights do not let it
+    erode the command, and |1 - k + k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k. Q ends earlier
+    if the model's lag would have to be inverted far above its frequency (`known_share`). The learned command
+    is limited by the command that the model alone would give (`bounded`).
 
-    `identify_trials` trials are identified together: beyond the on-off trial 0 the first
-    learned commands show the extruder as it will be driven.
+    `identify_trials` trials are identified together. After the on-off trial 0, the first learned commands
+    show the extruder as it will be driven.
     """
 
     def __init__(self, r: np.ndarray, settings: InverseSettings, *, drive: Drive, sample_time_s: float):
@@ -289,11 +294,12 @@ class InverseLaw:
         return command(x, self.r, extruder, drive=self.drive, sample_time_s=self.sample_time_s)
 
     def _smooth(self, x: np.ndarray, model: Extruder) -> np.ndarray:
-        """T Q x (..., T): below the law's cut-off, and where the model's lag is known (`known_share`)."""
+        """Returns T Q x (..., T): x below the law's cut-off, and only where the model's lag is known
+        (`known_share`)."""
         return known(zero_phase(x, **self.q), model, sample_time_s=self.sample_time_s)
 
     def _identified(self, first: list[Trial]) -> TrialModel:
-        """The model of the trials `first`, identified once."""
+        """Returns the model of the trials `first`, identified once."""
         same = len(first) == len(self._first) and all(map(operator.is_, first, self._first))
         if self.model is None or not same:
             u, y = [trial.u for trial in first], [trial.y for trial in first]
@@ -306,19 +312,23 @@ class InverseLaw:
 
 
 def gamma(Q: np.ndarray, L: np.ndarray, P: np.ndarray, delta: np.ndarray | float = 0.0) -> np.ndarray:
-    """max over frequency and over all |Delta'(f)| <= delta(f) of |Q (1 - L P (1 + Delta'))|, which is |Q| (|1
-    - L P| + |L P| delta): below 1 the error shrinks monotonically, above 1 it grows in the end (Bristow,
-    Tharayil and Alleyne 2006; with the multiplicative uncertainty delta, de Roover and Bosgra 2000).
+    """Returns the largest convergence factor over frequency f and all |Delta'(f)| <= delta(f).
 
-    Q (F,) is |Q|^2 if Q runs both ways; L (F,); delta (F,); P (F,) or (plants, F), with all
-    the delay there is: the result is one number a plant.
+        gamma = max |Q (1 - L P (1 + Delta'))| = max |Q| (|1 - L P| + |L P| delta)
+
+    Below 1 the error shrinks monotonically, above 1 it grows in the end (Bristow, Tharayil and Alleyne 2006;
+    with the multiplicative uncertainty delta, de Roover and Bosgra 2000).
+
+    Q (F,) is |Q|^2 if Q runs both ways; L (F,); delta (F,); P (F,) or (plants, F) with the whole delay. The
+    result is one number per plant.
     """
     return np.max(np.abs(Q) * (np.abs(1 - L * P) + np.abs(L * P) * delta), axis=-1)
 
 
 class ActuatorHeadroom(NamedTuple):
-    """What the drive leaves: peak (mm) and speed (mm/s) of the command that r needs, its steady command (mm),
-    the least error as a share of trial 0's, and the ramp that would do."""
+    """The headroom of the drive. `peak` (mm) and `speed` (mm/s): of the command that r needs; `steady`: its
+    steady command (mm); `ratio`: the least error as a share of trial 0's; `ramp_s`: the shortest ramp that
+    the drive can follow."""
 
     peak: float
     steady: float
@@ -337,11 +347,12 @@ def actuator_headroom(
     drive: Drive,
     sample_time_s: float,
 ) -> ActuatorHeadroom:
-    """Headroom of the drive over the model for r (T,): the least error is that of the nearest flow that the
-    drive can follow, as a share of what u0 (T,) leaves. Its backlash, which is learned, is left out.
+    """Returns the headroom of the drive over the model for r (T,). The least error is that of the nearest
+    flow that the drive can follow, as a share of the error with u0 (T,). Backlash is left out, because it is
+    learned.
 
-    ramp_s is the longer of what solves (1 + tau / t_ramp) steady = amplitude and (1 + tau / t_ramp) steady /
-    t_ramp = speed; it is infinite where the amplitude does not even hold the steady flow.
+    ramp_s is the longer of the solutions of (1 + tau / t_ramp) steady = amplitude and (1 + tau / t_ramp)
+    steady / t_ramp = speed. It is infinite if the amplitude is not above the steady command.
     """
     x = zero_phase(
         wanted(r, model.yield_, sample_time_s=sample_time_s),
@@ -363,14 +374,15 @@ def actuator_headroom(
 
 
 def _ramp_of_amplitude(drive: Drive, steady: float, model: Extruder) -> float:
-    """The ramp in s whose peak command is the amplitude, (1 + tau / ramp) steady; 0 without a limit."""
+    """Returns the ramp in s whose peak command (1 + tau / ramp) steady is the amplitude; 0 without a
+    limit."""
     over = drive.amplitude_mm / steady
     return model.time_constant_s / (over - 1) if over > 1 else math.inf
 
 
 def _ramp_of_speed(drive: Drive, steady: float, model: Extruder) -> float:
-    """The ramp in s over which the command goes to (1 + tau / ramp) steady at the speed; 0 without a
-    limit."""
+    """Returns the ramp in s over which the command rises to (1 + tau / ramp) steady at the speed limit; 0
+    without a limit."""
     rate = drive.speed_mm_per_s / steady
     if math.isinf(rate):
         return 0.0
@@ -378,8 +390,8 @@ def _ramp_of_speed(drive: Drive, steady: float, model: Extruder) -> float:
 
 
 def check_headroom(headroom: ActuatorHeadroom, *, drive: Drive, worst_ratio: float) -> None:
-    """Raises ValueError if no law can come below `worst_ratio` of trial 0's
-    error: the sentence names the ramp that would do."""
+    """Raises ValueError if no law can bring the error below `worst_ratio` of trial 0's. The message names the
+    ramp that would be enough."""
     if headroom.ratio <= worst_ratio:
         return
     needs = (
@@ -403,8 +415,9 @@ def check_headroom(headroom: ActuatorHeadroom, *, drive: Drive, worst_ratio: flo
 
 
 class NextCommand(NamedTuple):
-    """Next command u (T,) in mm; the best trial of the machine as it is now; whether the last trial rose, so
-    that u goes back to the best; and the trials at which the machine was found changed."""
+    """The next command u (T,) in mm; `best`: the best trial of the machine as it is now; `rolled_back`:
+    whether the last trial rose, so that u goes back to the best; `restarts`: the trials at which a change of
+    the machine was found."""
 
     u: np.ndarray
     best: int
@@ -413,15 +426,15 @@ class NextCommand(NamedTuple):
 
 
 def rms(e: np.ndarray) -> float:
-    """Root mean square over what was observable."""
+    """Returns the root mean square of the observable samples."""
     observable = e[np.isfinite(e)]
     return float(np.sqrt(observable @ observable / len(observable)))
 
 
 def repeating_error(r: np.ndarray, y: np.ndarray) -> float:
-    """R.m.s. of r - g y, means over MEAN_OF samples, in mm^3/s: the error of a trial that another one would
-    show too. g, within 1 +- SCALE, is the scale that brings y nearest to r; r, y (T,), NaN where not
-    observable."""
+    """Returns the r.m.s. of r - g y in mm^3/s, by means over MEAN_OF samples: the part of a trial's error
+    that would repeat in the next trial. g is the scale within 1 +- SCALE that brings y nearest to r. r, y
+    (T,), y NaN where not observable."""
     observable = np.isfinite(y)
     flow, target = np.where(observable, y, 0.0), np.where(observable, r, 0.0)
     scale = flow @ target / max(float(flow @ flow), np.finfo(float).tiny)
@@ -430,10 +443,11 @@ def repeating_error(r: np.ndarray, y: np.ndarray) -> float:
 
 
 class LearningState(NamedTuple):
-    """The trials to learn from, those of the machine as it is now without those that rose; the one of them
-    with the least error; whether each trial has risen; the first trial after each change of the machine;
-    whether the next trial repeats the best command; the share of the way from the best command to the law's
-    that it goes otherwise; and whether the machine drifts."""
+    """The state of learning. `keep`: the trials to learn from, which are those of the machine as it is now
+    without those that rose; `best`: the one of them with the least error; `risen`: whether each trial has
+    risen; `restarts`: the first trial after each change of the machine; `repeat`: whether the next trial
+    repeats the best command; `share`: if not, the share of the way from the best command to the law's;
+    `drifts`: whether the machine drifts."""
 
     keep: list[int]
     best: int
@@ -445,17 +459,18 @@ class LearningState(NamedTuple):
 
 
 def judge(errors: Sequence[float], *, rise: float) -> LearningState:
-    """What the trials so far say of machine and law: a trial has risen whose error exceeds the best by more
-    than `rise` of trial 0's, and what the trials before it scatter or FAR times the best; it is worse where
-    it exceeds (1 + rise) times the best, and NOISE of trial 0's.
+    """Returns what the trials' errors so far show of machine and law. A trial has risen if its error exceeds
+    the best by more than `rise` of trial 0's, and also exceeds the scatter of the trials before it or FAR
+    times the best. A trial is worse if its error exceeds (1 + rise) times the best plus NOISE of trial 0's.
 
-    The law sends again what the drive could not reach, so it goes its way from the best command on: half as
-    far after each trial that is worse, GROWTH times as far after a new best. The trial after a rise, and
-    after a worse one of LITTLE share, repeats the best command, and this tells a law from a machine. Where
-    the error of old comes back, the law went too far, or that trial was spoilt: a trial that rose is left
-    out. Where the repeat is worse, the machine drifts, and the law goes on alone, with half its step after a
-    rise. Where the repeat rises after a rise, the machine changed: what was learned before the first of the
-    two is left.
+    The law sends again what the drive could not reach. So the next command goes only a share of the way from
+    the best command to the law's. The share is halved after each worse trial and grows by GROWTH after a new
+    best. After a rise, and after a worse trial with a share of LITTLE or less, the next trial repeats the
+    best command, which shows whether the law or the machine is the cause. If the old error comes back, the
+    law went too far or that trial was spoilt; a trial that rose is left out. If the repeat is worse, the
+    machine drifts: worse trials no longer halve the share, and the law takes its whole step, or the halved
+    one after a rise. If the repeat rises after a rise, the machine changed, and all trials before the first
+    of the two are dropped.
     """
     keep, best, risen, restarts = [0], 0, [False], []
     repeat, share, drifts = False, 1.0, False
@@ -484,13 +499,14 @@ def judge(errors: Sequence[float], *, rise: float) -> LearningState:
 
 
 def state_of(trials: Sequence[Trial], r: np.ndarray, *, rise: float) -> LearningState:
-    """What the trials on the wanted flow r (T,) say (`judge`), by the error that repeats."""
+    """Returns the state (`judge`) after the trials on the wanted flow r (T,), by their repeating errors."""
     return judge([repeating_error(r, trial.y) for trial in trials], rise=rise)
 
 
 def _scattered(errors: list[float]) -> float:
-    """The largest error that the scatter of these explains: their median and SCATTER standard deviations,
-    told from the changes between them, which are small where an error creeps up; 0 of fewer than four."""
+    """Returns the largest error that the scatter of these errors explains: their median plus SCATTER standard
+    deviations; 0 for fewer than four. The deviation is computed from the changes between them, because these
+    are small if an error creeps up."""
     if len(errors) < 4:
         return 0.0
     deviation = 1.4826 * float(np.median(np.abs(np.diff(errors)))) / math.sqrt(2)
@@ -498,12 +514,12 @@ def _scattered(errors: list[float]) -> float:
 
 
 def next_step(trials: Sequence[Trial], r: np.ndarray, law: Law, *, rise: float) -> NextCommand:
-    """What follows from the trials so far; nothing else is remembered,
-    so that a folder of recordings can be continued.
+    """Returns the next command after the trials so far. Nothing else is remembered, so a folder of recordings
+    can be continued.
 
-    After a trial that has risen (`judge`) the best command is repeated. If the machine changed, the law is
-    given the trials since alone, and so identifies its model anew; otherwise it goes on, by a share of its
-    step from the best command.
+    After a trial that has risen (`judge`) the best command is repeated. If the machine changed, the law gets
+    only the trials since then, so it identifies its model again. Otherwise it takes a share of its step from
+    the best command. Raises ValueError if a trial has other shapes than r, or no observable flow.
     """
     for j, (u, y, _) in enumerate(trials):
         if u.shape != r.shape or y.shape != r.shape or not np.isfinite(y).any():
@@ -532,7 +548,8 @@ def learn(
     rise: float,
     on_step: Callable[[Trial], None] = lambda trial: None,
 ) -> list[Trial]:
-    """Trial 0 with u0 and `trials` updates. `measure` runs one command on a plant."""
+    """Runs trial 0 with u0 and then `trials` updates; returns all trials. `measure` runs one command on a
+    plant."""
     done = [measure(u0)]
     on_step(done[0])
     while len(done) <= trials:
@@ -542,8 +559,8 @@ def learn(
 
 
 class TrialRow(NamedTuple):
-    """One trial: errors in mm^3/s (true is NaN where nothing was simulated), ratio to trial 0 of the true
-    error where known, else of the measured one."""
+    """One trial: errors in mm^3/s (the true one is NaN if nothing was simulated); `ratio` to trial 0, of the
+    true error if known, else of the measured one."""
 
     trial: int
     rms_true: float
@@ -557,8 +574,8 @@ class TrialRow(NamedTuple):
 def table(
     trials: Sequence[Trial], r: np.ndarray, *, steady: float, drive: Drive, sample_time_s: float, rise: float
 ) -> list[TrialRow]:
-    """A row a trial; `steady` is the steady command in mm, saturated the share of time at a limit of the
-    drive, rolled_back whether the trial was left for a better one."""
+    """Returns one row per trial. `steady` is the steady command in mm. In a row, `saturated` is the share of
+    time at a limit of the drive, and `rolled_back` whether the trial was left for a better one."""
     measured = [rms(r - trial.y) for trial in trials]
     true = [np.nan if trial.truth is None else rms(r - trial.truth) for trial in trials]
     risen = state_of(trials, r, rise=rise).risen

@@ -1,5 +1,5 @@
-"""A machine learns its routines: on-off first, then the paper's law or the model inverse, trial after trial;
-and the convergence of both over a family of plants before anything runs."""
+"""A machine learns its routines trial by trial: on-off control first, then the paper's law or the model
+inverse. Before anything runs, both laws' convergence is tested over a family of plants."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
@@ -20,8 +20,8 @@ WRONG_GAIN = 3.0
 
 
 class LawSettings(NamedTuple):
-    """What both laws are built from: sample time in s; the drive; the settings of each law; `rise` of the
-    error, as share of trial 0's, that counts as one."""
+    """The settings of both laws: sample time in s; the drive; the settings of each law; `rise`: the increase
+    of the error, as share of trial 0's, that counts as a rise."""
 
     sample_time_s: float
     drive: Drive
@@ -31,7 +31,8 @@ class LawSettings(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """What does not repeat from trial to trial, as shares of the steady flow (`extruder.disturb`)."""
+    """Disturbances that do not repeat from trial to trial, as shares of the steady flow
+    (`extruder.disturb`)."""
 
     white: float
     drift: float
@@ -39,8 +40,8 @@ class Noise(NamedTuple):
 
 
 class TrialSequence(NamedTuple):
-    """What one law did with one routine: every trial, a row of figures for each (`ilc.Row`), and the model
-    that it identified where it did."""
+    """The trials of one law on one routine: every trial, a row of figures for each (`ilc.TrialRow`), and the
+    model if the law identified one."""
 
     law: str
     routine: Routine
@@ -50,7 +51,7 @@ class TrialSequence(NamedTuple):
 
 
 def hoelzle_2009(routine: Routine, nominal: Extruder, settings: LawSettings) -> Law:
-    """The paper's law (2) with Q both ways."""
+    """Returns the paper's law (2) with Q forward and backward."""
     return ilc.hoelzle_law(
         routine.r,
         nominal,
@@ -62,7 +63,7 @@ def hoelzle_2009(routine: Routine, nominal: Extruder, settings: LawSettings) -> 
 
 
 def model_inverse(routine: Routine, settings: LawSettings) -> ilc.InverseLaw:
-    """The inverse of the model identified from the first trials."""
+    """Returns the law by the inverse of the model identified from the first trials."""
     return ilc.InverseLaw(
         routine.r, settings.model_inverse, drive=settings.drive, sample_time_s=settings.sample_time_s
     )
@@ -71,8 +72,8 @@ def model_inverse(routine: Routine, settings: LawSettings) -> ilc.InverseLaw:
 def simulated(
     plant: Extruder, rng: np.random.Generator, noise: Noise, *, steady_flow: float, settings: LawSettings
 ) -> Callable[[np.ndarray], Trial]:
-    """A machine that runs a command u (T,) in mm: the true flow, and
-    the measured one with what does not repeat."""
+    """Returns a machine that runs a command u (T,) in mm. A trial has the true flow, and the measured flow
+    with the disturbances that do not repeat."""
 
     def measure(u: np.ndarray) -> Trial:
         truth = flow(plant, u, sample_time_s=settings.sample_time_s, drive=settings.drive)
@@ -95,7 +96,7 @@ def run_trials(
     settings: LawSettings,
     on_step: Callable[[Trial], None],
 ) -> TrialSequence:
-    """`trials` updates from on-off control, with roll-back (`ilc.learn`)."""
+    """Runs `trials` updates after on-off control, with roll-back (`ilc.learn`)."""
     u0 = routine.r / nominal.gain
     done = ilc.learn(law, measure, u0, routine.r, trials=trials, rise=settings.rise, on_step=on_step)
     rows = ilc.table(
@@ -120,8 +121,8 @@ def train(
     settings: LawSettings,
     on_step: Callable[[Trial], None],
 ) -> list[TrialSequence]:
-    """The paper's law on the reference routine and the model inverse on every routine, on the simulated
-    machine; last the paper's law on its own nominal model, as the paper ran it."""
+    """Runs the paper's law on the reference routine and the model inverse on every routine, on the simulated
+    machine. Last, it runs the paper's law on the law's own nominal model, as the paper did."""
     first, sequences = routines[0], []
     work = [
         ("hoelzle_2009", first, plant),
@@ -144,8 +145,9 @@ def train(
 
 
 def figures(sequence: TrialSequence, *, rise: float) -> dict[str, float | list[int]]:
-    """The ratios that the loop is judged by: at some trials, of the last, and the least of the machine as it
-    is now; the trials at which it was found changed, and what the command needs."""
+    """Returns the ratios by which the loop is judged: at some trials, of the last trial, and the lowest of
+    the machine as it is now; the trials at which a change of the machine was found; and what the command
+    needs."""
     rows = sequence.rows
     restarts = ilc.state_of(sequence.trials, sequence.routine.r, rise=rise).restarts
     now = rows[restarts[-1] if restarts else 0 :]
@@ -164,8 +166,8 @@ def figures(sequence: TrialSequence, *, rise: float) -> dict[str, float | list[i
 def convergence(
     nominal: Extruder, rng: np.random.Generator, *, plants: int, steady_flow: float, settings: LawSettings
 ) -> tuple[float, np.ndarray]:
-    """gamma of the paper's law on the nominal plant, and on each of `plants` draws around it, before anything
-    runs; below 1 the error shrinks at every trial.
+    """Returns gamma of the paper's law on the nominal plant, and on each of `plants` random plants around it,
+    before anything runs. Below 1 the error shrinks at every trial.
 
         gamma = max_f |Q (1 - L P)|
     """
@@ -187,13 +189,13 @@ def convergence(
 def convergence_of_model_inverse(
     sequence: TrialSequence, rng: np.random.Generator, noise: Noise, *, plants: int, settings: LawSettings
 ) -> tuple[float, np.ndarray]:
-    """gamma of the model inverse once its model is identified: of that model, and over plants that the first
-    trials cannot tell from it.
+    """Returns gamma of the model inverse once its model is identified: for that model, and for `plants`
+    plants that the first trials cannot tell from it.
 
         gamma = max_f |Q| (|1 - L P| + |L P Delta|)
 
-    That is the largest |Q (1 - L P (1 + Delta'))| of all |Delta'(f)| <= |Delta(f)|, and Delta is what the
-    model leaves of the trials that identified it and of the next one, which it has not seen
+    That is the largest |Q (1 - L P (1 + Delta'))| of all |Delta'(f)| <= |Delta(f)|. Delta is the part that
+    the model does not explain of the trials that identified it and of the next one, which it has not seen
     (`trial_model.unmodelled`).
     """
     e, law, Ts = sequence.model.extruder, settings.model_inverse, settings.sample_time_s
@@ -223,9 +225,9 @@ def convergence_of_model_inverse(
 def actuator_headroom(
     routine: Routine, nominal: Extruder, *, worst_ratio: float, settings: LawSettings
 ) -> ilc.ActuatorHeadroom:
-    """What the drive leaves of the routine, on the nominal model, before anything
-    runs. Raises ValueError if no law can come below worst_ratio of the error of on-off
-    control; the sentence names the ramp that would do."""
+    """Returns the headroom of the drive on the routine, by the nominal model, before anything runs. Raises
+    ValueError if no law can bring the error below worst_ratio of on-off control's; the message names the ramp
+    that would be enough."""
     headroom = ilc.actuator_headroom(
         routine.r,
         routine.r / nominal.gain,
@@ -249,8 +251,8 @@ def prospects(
     steady_flow: float,
     worst_ratio: float,
 ) -> dict[str, Any]:
-    """What is known before anything runs: gamma of the paper's law on the nominal model and over the family,
-    and the headroom of the drive over each routine."""
+    """Returns what is known before anything runs: gamma of the paper's law on the nominal model and over the
+    family, and the headroom of the drive on each routine."""
     gamma, family = convergence(nominal, rng, plants=plants, steady_flow=steady_flow, settings=settings)
     headrooms = [
         actuator_headroom(routine, nominal, worst_ratio=worst_ratio, settings=settings)
@@ -279,9 +281,9 @@ def learn_in_flow(
     settings: LawSettings,
     on_step: Callable[[Trial], None],
 ) -> tuple[dict[int, list[TrialSequence]], dict[str, Any], dict[str, Any]]:
-    """Both laws on the measured flow of a simulated machine: their sequences by number of the routine,
-    figures, and the models as JSON. `rngs` draw what does not repeat, and the plants of the convergence
-    test."""
+    """Runs both laws on the measured flow of a simulated machine. Returns their sequences by number of the
+    routine, figures, and the models as JSON. `rngs`: the first draws the disturbances that do not repeat, the
+    second the plants of the convergence test."""
     sequences = train(
         nominal, plant, routines, rngs[0], noise, trials=trials, settings=settings, on_step=on_step
     )
@@ -304,9 +306,9 @@ def learn_in_flow(
 def resume(
     trials: Sequence[Trial], routine: Routine, nominal: Extruder, settings: LawSettings
 ) -> tuple[TrialSequence | None, np.ndarray, dict[str, Any]]:
-    """What was learned in the trials so far, the next command u (T,) in mm, and its figures: trial 0 is
-    on-off control. Raises ValueError if they show another gain than the nominal one by more than
-    WRONG_GAIN."""
+    """Returns the trials so far as a sequence (None without trials), the next command u (T,) in mm, and its
+    figures. Trial 0 is on-off control. Raises ValueError if the trials show a gain that differs from the
+    nominal one by more than WRONG_GAIN."""
     u0 = routine.r / nominal.gain
     if not trials:
         first = obeyed(u0, settings.drive, sample_time_s=settings.sample_time_s)
@@ -328,7 +330,7 @@ def resume(
 
 
 def model_figures(model: ilc.TrialModel | None) -> dict[str, float] | None:
-    """An identified model as JSON."""
+    """Returns an identified model as JSON; None without a model."""
     if model is None:
         return None
     e = model.extruder
@@ -340,8 +342,8 @@ def model_figures(model: ilc.TrialModel | None) -> dict[str, float] | None:
 
 
 def join(parts: Iterable[tuple[dict, dict, dict, dict]]) -> tuple[dict, dict, dict, dict]:
-    """All results as one: trial sequences and measured trials by (material, number of the routine), models
-    and figures by material; dictionaries of one material are put together."""
+    """Joins all results: trial sequences and measured trials by (material, number of the routine), models and
+    figures by material. Dictionaries of one material are merged."""
     sequences, measured, models, figures = {}, {}, {}, {}
     for part in parts:
         for key, of_routine in part[0].items():
@@ -357,7 +359,7 @@ def join(parts: Iterable[tuple[dict, dict, dict, dict]]) -> tuple[dict, dict, di
 
 
 def trial_rows(sequences: dict[tuple[str, int], list[TrialSequence]]) -> dict[str, np.ndarray]:
-    """One row a trial of every sequence, by (material, number of the routine)."""
+    """Returns one row per trial of every sequence, by (material, number of the routine)."""
     names = ("material", "law", "routine", "speed_mm_per_s", "pause_s", *ilc.TrialRow._fields)
     rows = [
         (material, one.law, index, one.routine.plan["speed_mm_per_s"], one.routine.plan["pause_s"], *row)
@@ -371,7 +373,7 @@ def trial_rows(sequences: dict[tuple[str, int], list[TrialSequence]]) -> dict[st
 
 
 def sample_rows(sequences: dict[tuple[str, int], list[TrialSequence]]) -> dict[str, np.ndarray]:
-    """Every sample of every trial of every sequence: what a library is cut from."""
+    """Returns every sample of every trial of every sequence; a library is cut from them."""
     names = ("material", "law", "routine", "trial", "time_s", "wanted_mm3_per_s")
     names += ("command_mm", "measured_mm3_per_s", "true_mm3_per_s")
     parts = [

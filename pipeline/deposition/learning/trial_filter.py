@@ -1,5 +1,5 @@
-"""What repeats from trial to trial beyond the model, filtered over the trials: a disturbance, and a gain that
-may change. How fast each is followed is chosen by what would have foretold the trials best."""
+"""Filters the part of the trials that repeats and that the model does not explain: a disturbance, and a gain
+that may change. The speed at which each is followed is the one that would have predicted the trials best."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -28,9 +28,9 @@ GAIN_BOUNDS = (0.2, 5.0)
 
 
 class Repeating(NamedTuple):
-    """y = max(gain (G u + disturbance) - yield, 0): the disturbance (T,) in mm^3/s, the gain of the next
-    trial over the model's as forecast; `weight`, the least weight of a new trial that was chosen, and
-    `follower`, what follows the gain (0 its mean, k the k-th of FOLLOWERS)."""
+    """y = max(gain (G u + disturbance) - yield, 0). `disturbance` (T,) in mm^3/s; `gain`: forecast for the
+    next trial, relative to the model's gain; `weight`: the chosen least weight of a new trial; `follower`:
+    the method that follows the gain (0 its mean, k the k-th of FOLLOWERS)."""
 
     disturbance: np.ndarray
     gain: float
@@ -48,21 +48,22 @@ def repeating(
     smooth: Callable[[np.ndarray], np.ndarray],
     sample_time_s: float,
 ) -> Repeating:
-    """Of the commands u (J, T) in mm and flows y (J, T) in mm^3/s of all trials, NaN where not observable,
-    for the wanted flow r (T,); `smooth` is Q: (..., T) -> (..., T).
+    """Returns the repeating part of the commands u (J, T) in mm and flows y (J, T) in mm^3/s of all trials, y
+    NaN where not observable, for the wanted flow r (T,). `smooth` is Q: (..., T) -> (..., T).
 
-    A Kalman filter over trials, g_j the gain of trial j by least squares of its flow; the first trials count
-    in full and with g = 1:
+    A Kalman filter over trials, with g_j the gain of trial j by least squares of its flow. The first trials
+    count in full and with g = 1:
 
         k_j = max(1/j, least)
         d <- d + k_j ((y + yield) / g_j - (G u_j + d))
 
-    A static machine wants 1/j. On one that changes a faster weight foretells the next trial better, of the
-    disturbance by its Q-filtered innovation, of the gain by that of ln g_j: this evidence chooses
-    (exponential smoothing and its trend: Holt 1957; chosen by one-step errors: Gardner 2006).
+    For a machine that does not change 1/j is best. On a machine that changes a larger weight predicts the
+    next trial better. The errors of these predictions choose the weights: for the disturbance the Q-filtered
+    innovation, for the gain that of ln g_j (exponential smoothing and its trend: Holt 1957; chosen by
+    one-step errors: Gardner 2006).
 
-    Nothing is learned where the flow was not observable, nor where none is wanted, predicted or seen: below
-    the yield y says nothing of x, and noise would be summed up trial after trial.
+    Nothing is learned where the flow was not observable, nor where no flow is wanted, predicted or measured.
+    Below the yield y does not show x, and noise would be summed up trial after trial.
     """
     e, trials, least = model.extruder, len(u), np.maximum((floor, *WEIGHTS), floor)
     observable, flow = np.isfinite(y), np.nan_to_num(y)
@@ -86,15 +87,15 @@ def repeating(
 
 
 def gain_forecasts(log_gain: np.ndarray) -> np.ndarray:
-    """Forecasts (1 + followers, J + 1) of ln g_j from those before j, of a series (J,): its mean, and the
-    level and slope of each of FOLLOWERS."""
+    """Returns forecasts (1 + followers, J + 1) of ln g_j from those before j, of a series (J,): by its mean,
+    and by the level and slope of each of FOLLOWERS."""
     count = np.arange(1, len(log_gain) + 1)
     mean = np.concatenate([[0.0], np.cumsum(log_gain) / count])
     return np.array([mean, *(_followed(log_gain, *weights) for weights in FOLLOWERS)])
 
 
 def _followed(series: np.ndarray, level_weight: float, slope_weight: float) -> np.ndarray:
-    """Holt's forecasts (J + 1,) of a series (J,)."""
+    """Returns Holt's forecasts (J + 1,) of a series (J,)."""
     level = slope = 0.0
     forecasts = [0.0]
     for j, value in enumerate(series.tolist()):
@@ -106,15 +107,17 @@ def _followed(series: np.ndarray, level_weight: float, slope_weight: float) -> n
 
 
 def _log_gain(x: np.ndarray, pressing: np.ndarray, told: np.ndarray) -> np.ndarray:
-    """ln g (F,) of least |pressing - g x|^2 over the samples told; x (F, T), pressing (T,), told (F, T)."""
+    """Returns ln g (F,) of least |pressing - g x|^2 over the samples in `told`; x (F, T), pressing (T,), told
+    (F, T)."""
     weighted = np.where(told, x, 0.0)
     power = np.maximum(np.sum(weighted * x, axis=-1), np.finfo(float).tiny)
     return np.log(np.clip(np.sum(weighted * pressing, axis=-1) / power, *GAIN_BOUNDS))
 
 
 def _foretold_best(squares: np.ndarray, margin: float) -> int:
-    """Of squared forecast errors (candidates, J) the candidate with the least, recent ones counting more; the
-    first, which is the slowest, unless another's are below `margin` of its own."""
+    """Returns the index of the candidate with the least squared forecast errors (candidates, J), with more
+    weight on recent ones. The first candidate, which is the slowest, is kept unless the best is below
+    `margin` of it."""
     sums = squares @ MEMORY ** np.arange(squares.shape[1])[::-1]
     best = int(np.argmin(sums))
     return best if sums[best] < margin * sums[0] else 0

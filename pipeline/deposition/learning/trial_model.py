@@ -1,6 +1,6 @@
-"""What one measured trial tells of the extruder: gain, time constant, total delay and yield by least squares,
-each with its uncertainty; a second-order lag beside the delay; up and down apart; and what the model does not
-know of the machine, as a multiplicative uncertainty of its frequency response."""
+"""Identifies the extruder from measured trials: gain, time constant, total delay and yield by least squares,
+each with its uncertainty; a second-order lag in addition to the delay; and the part of the machine that the
+model does not describe, as a multiplicative uncertainty of its frequency response."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -31,11 +31,11 @@ EXCITED = 4.0
 
 
 class TrialModel(NamedTuple):
-    """y = max(K / (tau s + 1) e^(-delay s) u - yield, 0), the delay holding all that is late (transport and
-    lag), or, of `identify_with_lag`, with the lag apart.
+    """y = max(K / (tau s + 1) e^(-delay s) u - yield, 0). The delay includes everything that is late
+    (transport and lag); in the model of `identify_with_lag` the lag is separate.
 
-    `extruder` holds K (mm^3/s per mm), tau, delay (s) and yield (mm^3/s). noise is the r.m.s. of what the
-    model leaves, mm^3/s; fit_percent the NRMSE 100 (1 - |y - ŷ| / |y - mean y|).
+    `extruder` holds K (mm^3/s per mm), tau, delay (s) and yield (mm^3/s). `noise`: r.m.s. of the residual,
+    mm^3/s; `fit_percent`: the NRMSE 100 (1 - |y - ŷ| / |y - mean y|).
     """
 
     extruder: Extruder
@@ -44,12 +44,13 @@ class TrialModel(NamedTuple):
 
 
 def identify(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float) -> TrialModel:
-    """The model that simulates the trials best from rest, however well it fits:
+    """Returns the model that simulates the trials best from rest, however well it fits:
 
         min over (K, tau, delay, yield) of sum (max(x - yield, 0) - y)^2
 
     u (T,) in mm and measured flow y (T,) in mm^3/s of each trial; NaN in y is a sample that was not
-    observable. Raises ValueError if the command never moves, or hardly any flow was observable.
+    observable. Raises ValueError if the command never changes, if hardly any flow was observable, or if the
+    flow does not rise with the command.
     """
     u, y = [np.asarray(a, float) for a in u], [np.asarray(b, float) for b in y]
     _check(u, y)
@@ -86,7 +87,7 @@ def identify(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s:
 
 
 def _model(extruder: Extruder, left: np.ndarray, measured: np.ndarray) -> TrialModel:
-    """The model with what it leaves of the flow measured (samples,)."""
+    """Returns the model with its residual `left` (samples,) of the measured flow (samples,)."""
     spread = max(np.linalg.norm(measured - measured.mean()), np.finfo(float).tiny)
     fit_percent = float(100 * (1 - np.linalg.norm(left) / spread))
     return TrialModel(extruder, float(np.sqrt(np.mean(left**2))), fit_percent)
@@ -95,11 +96,14 @@ def _model(extruder: Extruder, left: np.ndarray, measured: np.ndarray) -> TrialM
 def identify_with_lag(
     u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float
 ) -> TrialModel:
-    """As `identify`, with what is late as delay and second-order lag (`Extruder.lag_hz`).
+    """Returns the model as `identify`, with the lateness as delay and second-order lag (`Extruder.lag_hz`).
+    It minimises over (K, tau, delay, lag, yield)
 
-    min over (K, tau, delay, lag, yield) of sum (max(x - yield, 0) - y)^2 + (noise ln(lag / USUAL_LAG_HZ) /
-    LAG_SPREAD)^2: a prior, for a first trial leaves a valley between delay and lag. Without a lag the inverse
-    is wrong by half a turn on a machine of third order.
+        sum (max(x - yield, 0) - y)^2 + (noise ln(lag / USUAL_LAG_HZ) / LAG_SPREAD)^2
+
+    The last term is a prior, because a first trial hardly separates delay and lag. Without a lag the inverse
+    is wrong by half a turn on a machine of third order. Raises ValueError also if the best model fits less
+    than LEAST_FIT_PERCENT.
     """
     first = identify(u, y, sample_time_s=sample_time_s)
     u, y = [np.asarray(a, float) for a in u], [np.asarray(b, float) for b in y]
@@ -137,15 +141,15 @@ def identify_with_lag(
 
 
 def lag_delay_s(lag_hz: float) -> float:
-    """How late the second-order lag makes what is slow, 2 zeta / w, in s."""
+    """Returns the delay of slow signals by the second-order lag, 2 zeta / w, in s."""
     return DAMPING / (np.pi * lag_hz)
 
 
 def _coarse(
     predicted: Callable[[float, float, float, float], np.ndarray], measured: np.ndarray
 ) -> tuple[float, float, float]:
-    """Gain, time constant and delay of the best first-order model on a grid. Raises ValueError if its gain
-    is not above 0."""
+    """Returns gain, time constant and delay of the best first-order model on a grid. Raises ValueError if its
+    gain is not above 0."""
     starts = []
     for tau in TIME_CONSTANTS_S:
         for delay in DELAYS_S:
@@ -170,12 +174,13 @@ def deviations(
     trial_gain: float,
     sample_time_s: float,
 ) -> tuple[float, float, float, float]:
-    """One standard deviation of K (mm^3/s per mm), tau (s), delay (s)
-    and yield (mm^3/s) of `identify` on the trials u, y.
+    """Returns one standard deviation of K (mm^3/s per mm), tau (s), delay (s) and yield (mm^3/s) of
+    `identify` on the trials u, y.
 
-    The estimate moves by J^+ w, J the change of the predicted flow with the four; w is white noise of the
-    model's own r.m.s., a random walk whose r.m.s. over a trial is `drift` of the highest flow, and a share
-    `trial_gain` of the flow itself: the last two are not to be seen in one trial's residual.
+    The estimate changes by J^+ w, with J the change of the predicted flow with the four parameters. w is the
+    sum of white noise of the model's own r.m.s., a random walk whose r.m.s. over a trial is `drift` of the
+    highest flow, and a share `trial_gain` of the flow itself. The residual of one trial does not show the
+    last two.
     """
     e = model.extruder
     theta = np.array([e.gain, e.time_constant_s, e.delay_s, e.yield_])
@@ -229,15 +234,16 @@ def unmodelled(
     *,
     sample_time_s: float,
 ) -> np.ndarray:
-    """|Delta(f)| (F,) of P = P_model (1 + Delta), from the trials that identified the model; 0 at frequencies
-    that they do not excite.
+    """Returns |Delta(f)| (F,) of P = P_model (1 + Delta), from the trials that identified the model; 0 at
+    frequencies that they do not excite.
 
         |Delta|^2 = (S_residual - S_noise) / S_flow
 
-    The residual y - y_model is that of the whole model with its dead band, each spectrum summed over the
+    The residual y - y_model is that of the whole model with its dead band. Each spectrum is summed over the
     trials and smoothed over SMOOTHED_HZ; S_noise is the level of the residual at the highest frequencies.
-    What does not repeat and is slow counts as Delta: one trial does not tell it from the machine. u (T,) in
-    mm and y (T,) in mm^3/s of each trial, NaN where not observable; frequency_hz (F,)."""
+    Slow disturbances that do not repeat count as Delta, because one trial does not separate them from the
+    machine. u (T,) in mm and y (T,) in mm^3/s of each trial, NaN where not observable; frequency_hz (F,).
+    """
     n = max(len(a) for a in u)
     f = np.fft.rfftfreq(n, sample_time_s)
     residual, simulated = np.zeros(len(f)), np.zeros(len(f))

@@ -1,5 +1,5 @@
-"""The whole chain of the extruder identified from every learning trial, in the structure that trials left out
-prefer; its error on them; and the chains that the trials cannot tell from it."""
+"""Identifies the whole chain of the extruder from every learning trial. The trials that are left out decide
+its structure and give its error. The members are chains that the trials cannot tell from it."""
 
 import math
 from collections.abc import Sequence
@@ -14,11 +14,12 @@ from pipeline.deposition.parts.library import TooFewTrials, Training
 
 
 class IdentifiedExtruder(NamedTuple):
-    """An extruder as `extruder.Extruder`, in the same order, with what the trials may show beside it.
+    """An extruder with the fields of `extruder.Extruder`, in the same order, and further effects that the
+    trials may show.
 
-    Flow falls with fall_ratio times the time constant that it rises with; a further lag second_lag_s follows
-    the second-order one; flow = K level (p / level)^exponent, p the pressed mm and `level` the steady command
-    of the fastest routine. The defaults are the plain `Extruder`.
+    Flow falls with fall_ratio times the time constant of its rise. A further lag second_lag_s follows the
+    second-order lag. flow = K level (p / level)^exponent, with p the pressed mm and `level` the steady
+    command of the fastest routine. The defaults give the plain `Extruder`.
     """
 
     gain: float
@@ -66,12 +67,12 @@ UNLIKELY = 1.05
 class Chain(NamedTuple):
     """The identified extruder, and how far to trust it.
 
-    `residual_percent` is the r.m.s. of measured minus simulated flow over all trials, `held_out_percent` the
-    r.m.s. error on learned trials of routines that the fit did not see, both in % of the steady flow; the
-    latter of means over AVERAGE_S. `structure` names what was kept beside gain, time constant, delay, lag,
-    play and yield. `left_out` are the fits without one routine (or, of one routine, one trial) each, in
-    their order, `members` those that the trials cannot tell from the best. `trials` were used, in `rows`
-    means.
+    `residual_percent`: r.m.s. of measured minus simulated flow over all trials; `held_out_percent`: r.m.s.
+    error on learned trials of routines that the fit did not see, of means over AVERAGE_S; both in % of the
+    steady flow. `structure`: the effects that were kept in addition to gain, time constant, delay, play and
+    yield. `left_out`: the fits without one routine each (without one trial each if there is only one
+    routine), in their order; `members`: the fits that the trials cannot tell from the best. `trials`: number
+    of trials used; `rows`: number of rows (`records`).
     """
 
     extruder: IdentifiedExtruder
@@ -85,8 +86,8 @@ class Chain(NamedTuple):
 
 
 class Records(NamedTuple):
-    """Rows (N, T) of commands u and measured flows y of `routine` (N,), weight (N, T) = root of the trials
-    behind a row, 0 where y is unknown or beyond the end."""
+    """Rows (N, T) of commands u and measured flows y; `routine` (N,): the routine of each row; `weight` (N,
+    T): root of the number of trials behind a row, 0 where y is unknown or beyond the end."""
 
     u: np.ndarray
     y: np.ndarray
@@ -95,8 +96,8 @@ class Records(NamedTuple):
 
 
 def records(trainings: Sequence[Training], *, early: int = 3) -> Records:
-    """All trials as rows: the first `early` of each routine alone, for there u still changes, the mean of the
-    later ones, whose commands hardly differ."""
+    """Returns all trials as rows. The first `early` trials of each routine are a row each, because u still
+    changes there. The later ones, whose commands hardly differ, are one row with their mean."""
     rows = []
     for index, training in enumerate(trainings):
         u, y = np.asarray(training.u, float), np.asarray(training.y, float)
@@ -112,14 +113,14 @@ def records(trainings: Sequence[Training], *, early: int = 3) -> Records:
 
 
 def first_order(x: np.ndarray, time_constant_s: float, sample_time_s: float) -> np.ndarray:
-    """1 / (tau s + 1) along the last axis, x held between samples."""
+    """Returns x after 1 / (tau s + 1) along the last axis; x is constant between samples."""
     a = math.exp(-sample_time_s / time_constant_s)
     return scipy.signal.lfilter([0.0, 1 - a], [1.0, -a], x)
 
 
 def asymmetric(x: np.ndarray, rise: np.ndarray, fall: np.ndarray) -> np.ndarray:
-    """p(t+1) = x(t) + a (p(t) - x(t)) from p(0) = 0 along the last axis of x (R, T): a = rise (R,) where p is
-    below x, fall (R,) where it is above."""
+    """Returns p(t+1) = x(t) + a (p(t) - x(t)) from p(0) = 0 along the last axis of x (R, T), with a = rise
+    (R,) if p is below x and a = fall (R,) if it is above."""
     out = np.empty_like(x)
     if len(x) < FEW_ROWS:
         for row, up, down, values in zip(out, rise.tolist(), fall.tolist(), x.tolist(), strict=True):
@@ -140,7 +141,7 @@ def asymmetric(x: np.ndarray, rise: np.ndarray, fall: np.ndarray) -> np.ndarray:
 
 
 def fronts(extruders: Sequence[IdentifiedExtruder], u: np.ndarray, sample_time_s: float) -> np.ndarray:
-    """u (N, T) behind the delay and the lags of each extruder: (P, N, T)."""
+    """Returns u (N, T) after the delay and the lags of each extruder: (P, N, T)."""
     made: dict[tuple[float, ...], np.ndarray] = {}
     for e in extruders:
         key = (e.delay_s, e.lag_hz, e.second_lag_s)
@@ -156,8 +157,8 @@ def fronts(extruders: Sequence[IdentifiedExtruder], u: np.ndarray, sample_time_s
 def simulate(
     extruders: Sequence[Extruder | IdentifiedExtruder], u: np.ndarray, *, sample_time_s: float
 ) -> np.ndarray:
-    """Flow (P, N, T) of each of P extruders under the rows u (N, T),
-    each from rest: extruder.flow for many at once, where that has the structure."""
+    """Returns the flow (P, N, T) of each of P extruders for the rows u (N, T), each from rest. It equals
+    extruder.flow for extruders of that structure, but computes many at once."""
     those = [IdentifiedExtruder(*e) for e in extruders]
     x = fronts(those, u, sample_time_s)
     x = backlash(x, np.array([e.play for e in those])[:, None])
@@ -179,7 +180,8 @@ def simulate(
 
 
 def flow_of(extruder: IdentifiedExtruder, p: np.ndarray) -> np.ndarray:
-    """K level (p / level)^exponent in mm^3/s of the pressed p in mm, odd in p: the flow without yield."""
+    """Returns K level (p / level)^exponent in mm^3/s for the pressed p in mm, odd in p: the flow before the
+    yield is subtracted."""
     if extruder.exponent == 1.0:
         return extruder.gain * p
     share = p / extruder.level
@@ -187,7 +189,7 @@ def flow_of(extruder: IdentifiedExtruder, p: np.ndarray) -> np.ndarray:
 
 
 def forecast(extruder: Extruder | IdentifiedExtruder, u: np.ndarray, *, sample_time_s: float) -> np.ndarray:
-    """Predicted flow (T,) of one command (T,) from rest."""
+    """Returns the predicted flow (T,) of one command (T,) from rest."""
     return simulate([extruder], u[None], sample_time_s=sample_time_s)[0, 0]
 
 
@@ -211,11 +213,11 @@ def _extruder(z: np.ndarray, steady_flow: float) -> IdentifiedExtruder:
 
 
 def innovations(error: np.ndarray, weight: np.ndarray, sample_time_s: float) -> np.ndarray:
-    """Weighted errors (P, N, T) without what white noise upon a random walk lets one foresee: (1 - q^-1) / (1
-    - theta q^-1), theta = exp(-Ts / DRIFT_S).
+    """Returns the part of the weighted errors (P, N, T) that cannot be predicted if they are white noise plus
+    a random walk: the errors filtered by (1 - q^-1) / (1 - theta q^-1), theta = exp(-Ts / DRIFT_S).
 
-    That is the whitening filter of such a measurement (Muth 1960). Where nothing
-    was seen (weight (N, T) 0) the last error seen stays, and the innovation is 0.
+    That is the whitening filter of such a measurement (Muth 1960). Where nothing was measured (weight (N, T)
+    0), the last measured error is kept, and the innovation is 0.
     """
     last = np.maximum.accumulate(np.where(weight > 0, np.arange(weight.shape[1]), 0), axis=1)
     held = np.take_along_axis(error * weight, np.broadcast_to(last, error.shape), axis=-1)
@@ -224,14 +226,15 @@ def innovations(error: np.ndarray, weight: np.ndarray, sample_time_s: float) -> 
 
 
 class ChainProblem(NamedTuple):
-    """What is fitted: rows, the steady flow (mm^3/s) that errors are shares of, the clock."""
+    """The problem to fit: the rows, the steady flow (mm^3/s) by which errors are divided, and the sample
+    time."""
 
     rows: Records
     steady_flow: float
     sample_time_s: float
 
     def flows(self, z: Sequence[np.ndarray]) -> np.ndarray:
-        """Simulated flow (P, N, T) of each vector of unknowns."""
+        """Returns the simulated flow (P, N, T) for each vector of unknowns."""
         extruders = [_extruder(one, self.steady_flow) for one in z]
         return simulate(extruders, self.rows.u, sample_time_s=self.sample_time_s)
 
@@ -240,8 +243,8 @@ class ChainProblem(NamedTuple):
 
 
 class ChainFit(NamedTuple):
-    """Unknowns z, those that were moved, and at z by row: Gauss-Newton's matrix H (N, p, p), its gradient g
-    (N, p), the sum of squared innovations cost (N,)."""
+    """The unknowns z, and the indices `free` of those that were fitted. At z, for each row: Gauss-Newton's
+    matrix H (N, p, p), its gradient g (N, p), the sum of squared innovations cost (N,)."""
 
     z: np.ndarray
     free: np.ndarray
@@ -250,12 +253,13 @@ class ChainFit(NamedTuple):
     cost: np.ndarray
 
     def without(self, out: np.ndarray) -> np.ndarray:
-        """The unknowns fitted to the rows but those in `out` (N,), by one step of Gauss-Newton from z."""
+        """Returns the unknowns fitted to all rows except those in `out` (N,), by one step of Gauss-Newton
+        from z."""
         return _stepped(self.z, self.free, self.H[~out].sum(axis=0), self.g[~out].sum(axis=0))
 
 
 def _normal(problem: ChainProblem, z: np.ndarray, free: np.ndarray) -> ChainFit:
-    """Gauss-Newton's equations at z: one batch of simulations."""
+    """Computes Gauss-Newton's equations at z by one batch of simulations."""
     sides = np.where(z + STEP < HIGH, STEP, -STEP)[free]
     shifted = np.repeat(z[None], len(free) + 1, axis=0)
     shifted[np.arange(1, len(free) + 1), free] += sides
@@ -268,7 +272,8 @@ def _normal(problem: ChainProblem, z: np.ndarray, free: np.ndarray) -> ChainFit:
 def _stepped(
     z: np.ndarray, free: np.ndarray, H: np.ndarray, g: np.ndarray, damping: float = 1e-9
 ) -> np.ndarray:
-    """z after one damped step of Gauss-Newton; what stands at its bound and is pushed beyond stays."""
+    """Returns z after one damped step of Gauss-Newton. An unknown at its bound is kept if the step would push
+    it beyond."""
     out = z.copy()
     pushed = ((z[free] <= LOW[free]) & (g > 0)) | ((z[free] >= HIGH[free]) & (g < 0))
     moves = np.flatnonzero(~pushed)
@@ -280,8 +285,8 @@ def _stepped(
 
 
 def fit(problem: ChainProblem, z: np.ndarray, free: np.ndarray, *, evaluations: int) -> ChainFit:
-    """The unknowns with those in `free` moved to the least sum of squared innovations of simulated - measured
-    flow (output error; Levenberg 1944 and Marquardt 1963 within bounds)."""
+    """Fits the unknowns in `free` by the least sum of squared innovations of simulated - measured flow
+    (output error; Levenberg 1944 and Marquardt 1963 within bounds). The other unknowns are kept."""
     best, damping = _normal(problem, z, free), 1e-4
     for _ in range(evaluations):
         H, g = best.H.sum(axis=0), best.g.sum(axis=0)
@@ -297,7 +302,8 @@ def fit(problem: ChainProblem, z: np.ndarray, free: np.ndarray, *, evaluations: 
 
 
 def _start(problem: ChainProblem) -> np.ndarray:
-    """K from the volume out by the displacement in, tau, delay by the best of a coarse grid."""
+    """Returns start values: K is the volume out divided by the displacement in; tau and delay are the best of
+    a coarse grid. Raises ValueError if the sum of the commands is not positive."""
     rows, steady_flow = problem.rows, problem.steady_flow
     displaced = np.sum(rows.u * (rows.weight > 0))
     if displaced <= 0:
@@ -319,8 +325,8 @@ def _start(problem: ChainProblem) -> np.ndarray:
 def _left_out(
     problem: ChainProblem, fitted: ChainFit, folds: np.ndarray
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """The unknowns fitted without each fold, and the flow (N, T) of every row by the fit that did not see
-    it."""
+    """Returns the unknowns fitted without each fold, and the flow (N, T) of every row by the fit without its
+    fold."""
     names, z = np.unique(folds), []
     for fold in names:
         rest = problem._replace(rows=Records(*(part[folds != fold] for part in problem.rows)))
@@ -330,8 +336,8 @@ def _left_out(
 
 
 class ChainCandidate(NamedTuple):
-    """A structure: the extras that it has, its fit, and the sum of squared innovations (N,) of each row by
-    the fit to the other routines."""
+    """A structure: its extras, its fit, and the sum of squared innovations (N,) of each row by the fit
+    without that row's fold."""
 
     extras: tuple[str, ...]
     fitted: ChainFit
@@ -352,17 +358,17 @@ def _candidate(
 
 
 def _prefers(better: ChainCandidate, than: ChainCandidate, folds: np.ndarray) -> bool:
-    """Whether what was left out prefers one structure: its squared innovations fall by MARGIN in all, and
-    fall in AGREE of the folds."""
+    """Returns whether the left-out rows prefer the structure `better`: their squared innovations fall by the
+    share MARGIN in total, and fall in the share AGREE of the folds."""
     fall = than.unseen - better.unseen
     agree = np.mean(np.bincount(folds, weights=fall)[np.unique(folds)] > 0)
     return bool(agree >= AGREE and fall.sum() > MARGIN * than.unseen.sum())
 
 
 def choose(problem: ChainProblem, folds: np.ndarray) -> list[ChainCandidate]:
-    """Forward selection: the extras whose fit promises most are tried in turn, and each is kept where rows
-    left out prefer it; last the lag goes where they do not miss it. All structures tried, the chosen
-    one first."""
+    """Chooses the structure by forward selection. In each round the two extras whose fit promises most are
+    tried, and the first that left-out rows prefer is kept. At the end the lag is removed unless they prefer
+    it. Returns all structures tried, the chosen one first."""
     kept = _candidate(problem, (LAG,), _start(problem), folds, 40)
     tried = []
     while True:
@@ -394,7 +400,8 @@ def choose(problem: ChainProblem, folds: np.ndarray) -> list[ChainCandidate]:
 
 
 def _with(z: np.ndarray, extra: str) -> np.ndarray:
-    """The unknowns with an extra set out from where it shows: a second lag takes half of what is late."""
+    """Returns the unknowns with an extra added, at a start value where it has an effect. A second lag takes
+    over half of the total lateness."""
     out = z.copy()
     if extra == "creep":
         out[6] = 0.05
@@ -406,8 +413,8 @@ def _with(z: np.ndarray, extra: str) -> np.ndarray:
 
 
 def averaged(error: np.ndarray, observable: np.ndarray, sample_time_s: float) -> float:
-    """R.m.s. of the means of an error over AVERAGE_S, where it was seen: what is left of white noise is a
-    fraction, what is left of an error of flow all of it."""
+    """Returns the r.m.s. of the means of an error over AVERAGE_S, where it was observable. The means keep
+    only a fraction of white noise but all of an error of the flow."""
     box = np.ones(round(AVERAGE_S / sample_time_s))
     count = np.convolve(observable, box, "same")
     return float(
@@ -421,17 +428,20 @@ def averaged(error: np.ndarray, observable: np.ndarray, sample_time_s: float) ->
 
 
 def _within(fitted: ChainFit, away: np.ndarray) -> np.ndarray:
-    """The unknowns moved by `away` (free,), within their bounds."""
+    """Returns the unknowns shifted by `away` (free,), within their bounds."""
     z, free = fitted.z.copy(), fitted.free
     z[free] = np.clip(z[free] + away, LOW[free], HIGH[free])
     return z
 
 
 def _members(problem: ChainProblem, fitted: ChainFit) -> list[np.ndarray]:
-    """MEMBERS vectors of unknowns that the trials cannot tell from the best: z +- what leaving out each
-    trial moves, the signs balanced over members (balanced repeated replication, McCarthy 1969).
+    """Returns MEMBERS vectors of unknowns that the trials cannot tell from the best: z plus or minus the
+    changes from leaving out each cluster of rows, with signs balanced over the members (balanced repeated
+    replication, McCarthy 1969).
 
-    Where a bound or a bend makes that worse than UNLIKELY, a member comes nearer."""
+    If a bound or a curvature makes a member worse than UNLIKELY, its distance from z is halved until it is
+    not.
+    """
     clusters = np.arange(len(fitted.cost)) % (MEMBERS - 1)
     moved = np.zeros((clusters.max() + 1, len(fitted.free)))
     for k in range(len(moved)):
@@ -447,12 +457,12 @@ def _members(problem: ChainProblem, fitted: ChainFit) -> list[np.ndarray]:
 
 
 def identify(trainings: Sequence[Training], *, sample_time_s: float) -> Chain:
-    """The chain of one material and nozzle from all its trials, in the structure that predicts routines left
-    out best.
+    """Identifies the chain of one material and nozzle from all its trials. Its structure is the one that best
+    predicts the routines left out.
 
-    One routine alone cannot be left out: then its rows are. Two speeds part gain from
-    yield, which one speed cannot (they are collinear on one plateau). Raises TooFewTrials
-    without two trials of each, and ValueError if the commands do not press.
+    If there is only one routine, its rows are left out instead. Two speeds separate gain from yield; one
+    speed cannot, because the two are collinear on one plateau. Raises TooFewTrials if there is no routine or
+    one has fewer than two trials, and ValueError if the commands do not press.
     """
     if not trainings or any(len(training.u) < 2 for training in trainings):
         raise TooFewTrials(

@@ -1,5 +1,6 @@
-"""Part program -> plunger command without learning again: the paper's priority rule, superposition, and basis
-functions; the one whose forecast is least at its upper end is taken."""
+"""Composes the plunger command of a part program without learning again, by pressure advance, the paper's
+priority rule, superposition, and basis functions. The composer is chosen whose forecast error has the lowest
+upper end."""
 
 import functools
 import math
@@ -39,11 +40,12 @@ EXCERPT_S = 600.0
 
 
 class LearnedMaterial(NamedTuple):
-    """What was learned of one material and nozzle: its chain, the gain (mm^3/s per mm) by
-    which on-off control set out in the first trial, and the error of the learned trials
-    themselves in % of the steady flow (means over 0.2 s); what fits without a routine missed on it, what the
-    routines covered, pressure advance as tuned on the chain, by composer, and the volume that came out in
-    the learned trials, in mm^3 a mm of what was pushed (a mm s of pressure)."""
+    """The results of learning for one material and nozzle. `chain`: its chain; `on_off_gain` (mm^3/s per mm):
+    the gain with which on-off control started in the first trial; `learned_percent`: error of the learned
+    trials themselves in % of the steady flow (means over 0.2 s); `missed`: the error, on each routine, of the
+    fit without it; `covered`: the range of the routines; `advances`: pressure advance as tuned on the chain,
+    by composer; `volume_per_mm`: the volume that came out in the learned trials, in mm^3 per mm of what was
+    pushed (per mm s of pressure)."""
 
     material: str
     nozzle_mm: float
@@ -57,7 +59,8 @@ class LearnedMaterial(NamedTuple):
 
 
 class LearnedLibrary(NamedTuple):
-    """The library of all materials, what the composers know of each, and the assumptions in figures."""
+    """The library of all materials, the results of learning for each material, and the assumptions in
+    figures."""
 
     library: Library
     materials: tuple[LearnedMaterial, ...]
@@ -65,9 +68,9 @@ class LearnedLibrary(NamedTuple):
 
 
 class PartSettings(NamedTuple):
-    """How a part is printed: nozzle in mm; the wanted flow is bead area x printing speed, its steps shaped by
-    two boxes of ramp_s; a junction is a Corner from corner_deg on; a longer halt than longest_pause_s ends a
-    run; the drive, and what the machine answers to."""
+    """How a part is printed. `nozzle_mm`; the wanted flow is `bead_area_mm2` x printing speed, its steps
+    shaped by two boxes of `ramp_s`; a junction is a Corner from `corner_deg` on; a halt longer than
+    `longest_pause_s` ends a run; `drive`; `command`: the quantity that the machine is commanded in."""
 
     nozzle_mm: float
     bead_area_mm2: float
@@ -79,8 +82,9 @@ class PartSettings(NamedTuple):
 
 
 class ComposerForecast(NamedTuple):
-    """Forecast r.m.s. error of one composer on one tool's share of a part, in % of that of on-off control:
-    90 % of what may come out lies between low and high. `chosen` is the composer with the least `high`."""
+    """Forecast r.m.s. error of one composer on one tool's share of a part, in % of that of on-off control. 90
+    % of the possible outcomes lie between `low` and `high`. `chosen`: whether this is the composer with the
+    lowest `high`."""
 
     tool: int
     material: str
@@ -92,10 +96,10 @@ class ComposerForecast(NamedTuple):
 
 
 class Stream(NamedTuple):
-    """One tool's share of a part, all (T,): wanted flow r (mm^3/s), the same before its steps were shaped,
-    command u (mm), predicted flow y and that of on-off control; the composer that u is from, what it knows of
-    the material, the share of the time that u is at a limit of the drive, and whether its forecast may be
-    believed."""
+    """One tool's share of a part, all (T,): wanted flow `r` (mm^3/s), and `unshaped`, the same before its
+    steps were shaped; command `u` (mm); predicted flow `y` and that of on-off control. `composer` gave u;
+    `learned`: what it knows of the material; `saturated`: the share of the time that u is at a limit of the
+    drive; `judged`: whether its forecast may be believed."""
 
     tool: int
     material: str
@@ -122,10 +126,10 @@ class ToolShare(NamedTuple):
 
 
 class Composed(NamedTuple):
-    """A part: its streams on one clock (sample k at k Ts; the gantry sets out lead_in_s later, which the
-    times of lines and tasks contain), and how each composer would do. error_percent (N,) is the predicted
-    error of the library's signal for each task, 0 for what was trained. The commands are speeds in mm/s if
-    the machine answers to a speed or a place."""
+    """A composed part: its streams with one clock, and the forecast of each composer. Sample k is at k Ts;
+    the gantry starts lead_in_s later, and the times of lines and tasks include this. error_percent (N,) is
+    the predicted error of the library's signal for each task, 0 for a trained task. The commands are speeds
+    in mm/s if the machine is commanded by speed or place."""
 
     streams: tuple[Stream, ...]
     tasks: Tasks
@@ -138,9 +142,11 @@ class Composed(NamedTuple):
 
 
 def learn(trainings: Sequence[Training], *, sample_time_s: float) -> LearnedLibrary:
-    """Library, chains, pressure advance and checks from all learned trials: what segment_library stores.
+    """Returns library, chains, pressure advance and checks from all learned trials, as segment_library stores
+    them.
 
-    Of each material and nozzle at least one routine; two speeds and two pauses make it hold for others.
+    Each material and nozzle needs at least one routine. With two speeds and two pauses it holds for other
+    speeds and pauses too.
     """
     library, materials = build(trainings, sample_time_s=sample_time_s), []
     tune = functools.partial(pressure_advance.tune, sample_time_s=sample_time_s)
@@ -176,8 +182,9 @@ def learn(trainings: Sequence[Training], *, sample_time_s: float) -> LearnedLibr
 
 
 def volume_per_mm(trainings: Sequence[Training]) -> float:
-    """What came out in all trials but the first over what was sent, mm^3 a mm: the identified flow ratio
-    times the area of what is pushed. Flow that was not observable counts as wanted."""
+    """Returns the volume that came out in all trials but the first, divided by the sum of the commands, in
+    mm^3 per mm: the identified flow ratio times the area of what is pushed. Flow that was not observable
+    counts as the wanted flow."""
     pairs = [
         (np.where(np.isfinite(y), y, t.r).sum(), u.sum())
         for t in trainings
@@ -194,8 +201,8 @@ def _of(tasks: Tasks, tool: int, name: str) -> np.ndarray:
 def _steady(
     library: Library, material: str, nozzle_mm: float, lines: PrintedLines, tool: int, samples: int
 ) -> np.ndarray:
-    """Steady-State (T,) from each printed line's begin to the next
-    one's in its run, at the level of its speed."""
+    """Returns Steady-State (T,) from the begin of each printed line to that of the next one in its run, at
+    the level of its speed."""
     mine = np.flatnonzero(lines.tool == tool)
     columns, column, factor, _ = nearest(
         library, STEADY, material, nozzle_mm, lines.speed[mine], np.zeros(len(mine))
@@ -210,8 +217,8 @@ def _steady(
 
 
 def _placed(library: Library, name: str, material: str, nozzle_mm: float, tasks: Tasks, tool: int):
-    """For each column of a finite task: (signal, samples (E, K) that
-    it takes at its E events, factors (E, 1))."""
+    """Yields for each library column of a finite task that is used: the column, the samples (E, K) that its
+    signal takes at its E events, and factors (E, 1)."""
     mine = _of(tasks, tool, name)
     columns, column, factor, _ = nearest(
         library, name, material, nozzle_mm, tasks.speed[mine], tasks.pause_s[mine]
@@ -236,8 +243,8 @@ def priority(
     *,
     samples: int,
 ) -> np.ndarray:
-    """u (T,) by the paper's hierarchy (fig. 7): at each sample the highest of Stop, Start, Corner,
-    Steady-State, No-Flow that is active; each sent ahead by its lead."""
+    """Returns u (T,) by the paper's hierarchy (fig. 7): at each sample the highest active task of Stop,
+    Start, Corner, Steady-State, No-Flow. Each signal is sent earlier by its lead."""
     u = np.append(_steady(library, material, nozzle_mm, lines, tool, samples), 0.0)
     for name in (CORNER, START, STOP):
         for chosen, at, factor in _placed(library, name, material, nozzle_mm, tasks, tool):
@@ -255,8 +262,8 @@ def superposition(
     *,
     samples: int,
 ) -> np.ndarray:
-    """u (T,) as the steady level with every task's deviation from it added, so that tasks which overlap both
-    count (the extruder is nearly linear)."""
+    """Returns u (T,): the steady level plus every task's deviation from it. Tasks that overlap both count,
+    because the extruder is nearly linear."""
     u = _steady(library, material, nozzle_mm, lines, tool, samples)
     levels = {still.speed: float(still.signal[0]) for still in of_task(library, STEADY, material, nozzle_mm)}
     for name in (CORNER, START, STOP):
@@ -268,14 +275,14 @@ def superposition(
 
 
 def by_basis_functions(library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
-    """u (T,) in mm of the basis functions for one tool's share of a part, which the drive can follow."""
+    """Returns u (T,) in mm by the basis functions for one tool's share of a part; the drive can follow it."""
     extruder = share.material.chain.extruder
     return basis.compose(extruder, share.r, sample_time_s=library.sample_time_s, drive=drive)
 
 
 def by_advance(name: str, library: Library, share: ToolShare, drive: Drive) -> np.ndarray:
-    """u (T,) in mm of pressure advance, by the numbers tuned for the composer `name`, as the drive follows
-    it."""
+    """Returns u (T,) in mm by pressure advance with the numbers tuned for the composer `name`, as the drive
+    follows it."""
     numbers = share.material.advances[name].tuned
     u = pressure_advance.command(numbers, share.r, sample_time_s=library.sample_time_s)
     return obeyed(u, drive, sample_time_s=library.sample_time_s)
@@ -284,7 +291,7 @@ def by_advance(name: str, library: Library, share: ToolShare, drive: Drive) -> n
 def by_library(
     rule: Callable[..., np.ndarray], library: Library, share: ToolShare, drive: Drive
 ) -> np.ndarray:
-    """u (T,) in mm of the library by a rule, as the drive can follow it."""
+    """Returns u (T,) in mm by a rule on the library, as the drive can follow it."""
     material, Ts = share.material, library.sample_time_s
     u = rule(
         library, material.material, material.nozzle_mm, share.tasks, share.lines, share.tool,
@@ -296,8 +303,8 @@ def by_library(
 
 
 def _sent_ahead(share: ToolShare, Ts: float) -> np.ndarray:
-    """The wanted flow (T,) at the time when a command for it is sent: earlier by delay and lag of the
-    chain."""
+    """Returns the wanted flow (T,) at the time when a command for it is sent: earlier by the delay and lag of
+    the chain."""
     extruder, t = share.material.chain.extruder, np.arange(len(share.r)) * Ts
     return np.interp(t + extruder.delay_s + basis.mean_lag_s(extruder), t, share.r, right=0.0)
 
@@ -316,14 +323,15 @@ COMPOSERS: dict[str, Callable[[Library, ToolShare, Drive], np.ndarray]] = {
 def commands(
     learned: LearnedLibrary, composed: Composed, stream: Stream, *, drive: Drive
 ) -> dict[str, np.ndarray]:
-    """The command (T,) of every composer for one stream of a part, to set beside the chosen one."""
+    """Returns the command (T,) of every composer for one stream of a part, for comparison with the chosen
+    one."""
     share = ToolShare(stream.tool, stream.learned, stream.r, composed.tasks, composed.lines)
     return {name: compose(learned.library, share, drive) for name, compose in COMPOSERS.items()}
 
 
 def _judge(library: Library, share: ToolShare, drive: Drive) -> dict[str, tuple[float, float, float]]:
-    """Forecast error of each composer in % of on-off control's, over the first EXCERPT_S from where this tool
-    begins to print: all by the same members and residuals."""
+    """Returns the forecast error of each composer (low, median, high) in % of on-off control's, over the
+    excerpt of the share (`_excerpt`). All composers are forecast by the same members and residuals."""
     Ts, material = library.sample_time_s, share.material
     excerpt = _excerpt(share, Ts)
 
@@ -340,7 +348,7 @@ def _judge(library: Library, share: ToolShare, drive: Drive) -> dict[str, tuple[
 
 
 def _excerpt(share: ToolShare, Ts: float) -> ToolShare:
-    """The first EXCERPT_S of a share with its own tasks and lines, its clock from MARGIN_S before the tool
+    """Returns EXCERPT_S of a share with its own tasks and lines. Its clock starts MARGIN_S before the tool
     begins to print."""
     r, tasks, lines = share.r, share.tasks, share.lines
     begin = max(0, int(np.argmax(r > 0)) - round(MARGIN_S / Ts))
@@ -355,7 +363,7 @@ def _excerpt(share: ToolShare, Ts: float) -> ToolShare:
 
 
 def _on_off(share: ToolShare, drive: Drive, Ts: float) -> np.ndarray:
-    """u (T,) in mm of on-off control, as the first trial set out: r over the gain known then."""
+    """Returns u (T,) in mm of on-off control, as in the first trial: r divided by the gain known then."""
     return obeyed(share.r / share.material.on_off_gain, drive, sample_time_s=Ts)
 
 
@@ -367,11 +375,12 @@ def compose(
     *,
     materials: dict[int, str],
 ) -> Composed:
-    """Commands for all tools of a part, each by the composer that is predicted to do best for its material.
+    """Returns the commands for all tools of a part. Each tool's command is made by the composer with the best
+    forecast for it.
 
-    `materials` names the material of each tool. Raises ValueError for a tool without a material, a
-    material or nozzle that was not learned, if nothing is printed, and, with its line number, if the
-    program would go from Steady-State to No-Flow without a Stop.
+    `materials` names the material of each tool. Raises ValueError if a tool has no material, if a material or
+    nozzle was not learned, if nothing is printed, and, with its line number, if the program would go from
+    Steady-State to No-Flow without a Stop.
     """
     library, drive, moves = learned.library, settings.drive, program.moves
     Ts, marks = library.sample_time_s, library.marks
@@ -413,8 +422,8 @@ def compose(
 def _wanted(
     moves: Moves, motion: Motion, settings: PartSettings, ahead: int, Ts: float
 ) -> dict[int, np.ndarray]:
-    """Wanted flow (T,) in mm^3/s of each tool that prints, before its steps are shaped, with `ahead` samples
-    of rest before the gantry sets out and MARGIN_S after the end."""
+    """Returns the wanted flow (T,) in mm^3/s of each tool that prints, before its steps are shaped. It has
+    `ahead` samples of rest before the gantry starts and MARGIN_S after the end."""
     signal = sampled(motion, moves, sample_time_s=Ts, rates_only=True)
     prints, around = (moves.kind == Kind.EXTRUDE) & (moves.length > 0), (ahead, math.ceil(MARGIN_S / Ts))
     return {
@@ -429,7 +438,8 @@ def _wanted(
 def _material(
     learned: LearnedLibrary, materials: dict[int, str], tool: int, nozzle_mm: float, lines: PrintedLines
 ) -> LearnedMaterial:
-    """What was learned of the tool's material with this nozzle."""
+    """Returns the results of learning for the tool's material with this nozzle. Raises ValueError if the tool
+    has no material, or this material and nozzle were not learned."""
     first = lines.line[lines.tool == tool][0]
     if tool not in materials:
         raise ValueError(
@@ -449,8 +459,9 @@ def _material(
 def _stream(
     library: Library, share: ToolShare, unshaped: np.ndarray, composer: str, settings: PartSettings
 ) -> Stream:
-    """The share by one composer: its command, and the flows that the chain predicts for it and for on-off. If
-    volume is conserved, what is pushed is the share's volume over what came out of the learned trials."""
+    """Returns the share by one composer: its command, and the flows that the chain predicts for it and for
+    on-off control. If the machine conserves volume, the command is scaled: its sum is the share's volume
+    divided by the volume per mm of the learned trials."""
     material, drive, Ts = share.material, settings.drive, library.sample_time_s
     u = COMPOSERS[composer](library, share, drive)
     if settings.command != "pressure":

@@ -1,7 +1,7 @@
-"""What a part will come to, as an interval: chains that the trials cannot tell apart, and what they all
-missed on routines left out, carried to the part by kind of event and time since it; or why it is not
-judged. And the shortest print that shows whether a forecast holds: the runs where it is least certain, with
-their gaps and pauses, on one straight track."""
+"""Forecasts the error of a part as an interval, or says why it cannot. It uses the chains that the trials
+cannot tell apart, and the error that they all make on routines left out, transferred to the part by kind of
+event and time since it. Also writes the shortest print that shows whether a forecast is right: the runs with
+the most uncertain flow, with their gaps and pauses, on one straight track."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -57,12 +57,12 @@ FILAMENT_MM2 = math.pi * 1.75**2 / 4
 
 
 class Missed(NamedTuple):
-    """What fits without a routine missed on it, simulated less measured, by_place (F, places) in shares of
-    the local flow, and three sizes in % of the error of the first trials, which on-off control makes, each
-    without what noise adds to it: all of what was missed, most of it at `event`; by how much the level moves
-    from the mean of the trials to the last of the next PRINTS; and the ripple that differs from one to
-    another. NaN where fewer than three trials with learned commands tell no noise. `level_percent` is the
-    second in % of the flow."""
+    """Errors of the fits on the routine that each did not see. `by_place` (F, places): simulated less
+    measured, in shares of the local flow. Three sizes are in % of the error of the first trials, which are
+    on-off control, each without the share of noise: `held_out_percent`, the whole error, most of it at
+    `event`; `change_percent`, the change of the level from the mean of the trials to the last of the next
+    PRINTS; `ripple_percent`, the ripple that differs from trial to trial. They are NaN if fewer than three
+    trials with learned commands do not show the noise. `level_percent` is the change in % of the flow."""
 
     by_place: np.ndarray
     held_out_percent: float
@@ -73,13 +73,13 @@ class Missed(NamedTuple):
 
     @property
     def percent(self) -> float:
-        """By how much a forecast may be wrong in all, in % of on-off control's error."""
+        """How far a forecast may be wrong in total, in % of on-off control's error."""
         return math.hypot(self.held_out_percent, self.change_percent, self.ripple_percent)
 
 
 class Covered(NamedTuple):
-    """What was trained: lowest and highest speed in mm/s and the wanted flow per speed (mm^2), the steepest
-    wanted flow in mm^3/s^2, the shortest pause and the longest run in s."""
+    """The range that was trained: lowest and highest speed in mm/s, wanted flow per speed (mm^2), steepest
+    change of the wanted flow in mm^3/s^2, shortest pause and longest run in s."""
 
     slowest: float
     fastest: float
@@ -90,7 +90,7 @@ class Covered(NamedTuple):
 
 
 class ForecastJudgement(NamedTuple):
-    """Whether the forecast may be believed; where not, the reason and the trial that would judge it."""
+    """Whether the forecast may be believed; if not, the reason, and the trial that would make it possible."""
 
     judged: bool
     reason: str
@@ -98,10 +98,11 @@ class ForecastJudgement(NamedTuple):
 
 
 def places(r: np.ndarray, sample_time_s: float) -> np.ndarray:
-    """Place (T,) of each sample of a wanted flow r (T,): event x BINS + bin of the time since it.
+    """Returns the place (T,) of each sample of a wanted flow r (T,): event x BINS + bin of the time since it.
 
-    Flow is wanted where r is above half of the most within NEAR_S / 2; it starts and stops there, and a gap
-    of at most NEAR_S is a Corner. Later than NEAR_S after it all is steady or off.
+    Flow is wanted where r is above half of its maximum within NEAR_S / 2. It starts and stops at the ends of
+    these stretches, and a gap of at most NEAR_S is a Corner. More than NEAR_S after an event everything is
+    steady or off.
     """
     n, near = len(r), round(NEAR_S / sample_time_s)
     on = r > 0.5 * np.maximum(scipy.ndimage.maximum_filter1d(r, near + 1, mode="constant"), 1e-12)
@@ -124,8 +125,8 @@ def places(r: np.ndarray, sample_time_s: float) -> np.ndarray:
 
 
 def mean_by_place(e: np.ndarray, seen: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Mean (..., places) of errors e (..., T) over the samples of each place (T,) that were seen (..., T); 0
-    where none was."""
+    """Returns the mean (..., places) of errors e (..., T) over the observed samples (..., T) of each place
+    (T,); 0 for a place without any."""
     one = np.zeros((len(EVENTS) * BINS, e.shape[-1]))
     one[place, np.arange(e.shape[-1])] = 1.0
     count = np.where(seen, 1.0, 0.0) @ one.T
@@ -133,8 +134,8 @@ def mean_by_place(e: np.ndarray, seen: np.ndarray, place: np.ndarray) -> np.ndar
 
 
 def missed(trainings: Sequence[Training], chain: Chain, *, sample_time_s: float, early: int = 3) -> Missed:
-    """What each fit of chain.left_out missed on its routine, in the trials after the `early` ones, whose
-    commands hardly differ."""
+    """Returns the error of each fit of chain.left_out on its routine, in the trials after the `early` ones,
+    whose commands hardly differ."""
     pairs = zip(trainings, chain.left_out, strict=True) if len(trainings) > 1 else None
     pairs = pairs or [(trainings[0], one) for one in chain.left_out]
     bias, rows = [], []
@@ -169,8 +170,8 @@ def missed(trainings: Sequence[Training], chain: Chain, *, sample_time_s: float,
 
 
 def _repeated(e: np.ndarray) -> np.ndarray:
-    """Square (T,) of what the rows of e (J, T) have in common: the mean of the products of different rows, to
-    which noise adds nothing. NaN for fewer than three rows."""
+    """Returns the square (T,) of what the rows of e (J, T) have in common: the mean of the products of
+    different rows, to which noise adds nothing. NaN for fewer than three rows."""
     J = len(e)
     return (
         (e.sum(axis=0) ** 2 - np.sum(e**2, axis=0)) / (J * (J - 1)) if J > 2 else np.full(e.shape[1], np.nan)
@@ -178,8 +179,8 @@ def _repeated(e: np.ndarray) -> np.ndarray:
 
 
 def _slope(e: np.ndarray, steady: np.ndarray) -> tuple[float, float]:
-    """Change of the steady level of e (J, T) from trial to trial, and the square of its standard error; NaN
-    for fewer than three trials."""
+    """Returns the change of the steady level of e (J, T) from trial to trial, and the square of its standard
+    error; NaN for fewer than three trials."""
     level = np.where(steady, e, 0.0).sum(axis=1) / np.maximum(steady.sum(axis=1), 1)
     if len(level) < 3:
         return math.nan, math.nan
@@ -190,9 +191,9 @@ def _slope(e: np.ndarray, steady: np.ndarray) -> tuple[float, float]:
 
 
 def _ripple(e: np.ndarray, steady: np.ndarray, sample_time_s: float) -> float:
-    """Variance within RIPPLE_S of what differs between the rows of e (J, T), over the steady samples (J, T),
-    less that of white noise, which half the mean square of successive differences tells (von Neumann 1941);
-    0 where no sample is steady."""
+    """Returns the variance within RIPPLE_S of the difference between the rows of e (J, T), over the steady
+    samples (J, T), less that of white noise; 0 if no sample is steady. White noise is half the mean square of
+    successive differences (von Neumann 1941)."""
     width, J = round(RIPPLE_S / sample_time_s), len(e)
     held = scipy.ndimage.minimum_filter1d(steady, 2 * round(SETTLED_S / sample_time_s) + 1, mode="constant")
     if J < 2 or not held.any():
@@ -206,7 +207,7 @@ def _ripple(e: np.ndarray, steady: np.ndarray, sample_time_s: float) -> float:
 
 
 def covered(trainings: Sequence[Training], *, sample_time_s: float) -> Covered:
-    """What the routines asked for."""
+    """Returns the range of the routines."""
     speeds = [training.speed for training in trainings]
     areas = [float(training.r.max()) / training.speed for training in trainings]
     steepest = max(float(np.abs(np.diff(training.r)).max()) for training in trainings) / sample_time_s
@@ -216,7 +217,7 @@ def covered(trainings: Sequence[Training], *, sample_time_s: float) -> Covered:
 
 
 def judged(missed: Missed, covered: Covered, r: np.ndarray, *, sample_time_s: float) -> ForecastJudgement:
-    """Whether a forecast of the wanted flow r (T,) may be believed."""
+    """Returns whether a forecast of the wanted flow r (T,) may be believed."""
     if not math.isfinite(missed.percent):
         return ForecastJudgement(
             False, "fewer than three trials with learned commands tell no noise", "run more trials"
@@ -249,7 +250,7 @@ def judged(missed: Missed, covered: Covered, r: np.ndarray, *, sample_time_s: fl
 
 
 def _asked(covered: Covered, r: np.ndarray, sample_time_s: float) -> ForecastJudgement:
-    """Whether what r (T,) asks for was trained."""
+    """Returns whether the speeds, changes, pauses and runs of r (T,) lie in the trained range."""
     near = round(NEAR_S / sample_time_s)
     on = r > 0.5 * np.maximum(scipy.ndimage.maximum_filter1d(r, near + 1, mode="constant"), 1e-12)
     edges = np.flatnonzero(np.diff(on.astype(int), prepend=0, append=0))
@@ -281,15 +282,16 @@ def _asked(covered: Covered, r: np.ndarray, sample_time_s: float) -> ForecastJud
 
 
 def flows(chain: Chain, missed: Missed, u: np.ndarray, r: np.ndarray, *, sample_time_s: float) -> np.ndarray:
-    """What may come out (M, T) of the command u (T,) for the wanted flow r (T,): the flow of each member of
-    the chain less what one routine left out missed, by place and in proportion to the flow wanted near by."""
+    """Returns possible flows (M, T) of the command u (T,) for the wanted flow r (T,): the flow of each member
+    of the chain less the error on one routine left out, by place and in proportion to the flow wanted near
+    by."""
     return np.stack(list(each_flow(chain, missed, u, r, sample_time_s=sample_time_s)))
 
 
 def each_flow(
     chain: Chain, missed: Missed, u: np.ndarray, r: np.ndarray, *, sample_time_s: float
 ) -> Iterator[np.ndarray]:
-    """`flows`, one row (T,) after the other."""
+    """Yields the rows (T,) of `flows` one after the other."""
     members = chain.members if len(r) <= LONG else chain.members[:: len(chain.members) // FEW]
     place, near = places(r, sample_time_s).astype(np.int16), round(NEAR_S / sample_time_s)
     local = scipy.ndimage.maximum_filter1d(r, 2 * near + 1, mode="constant")
@@ -304,7 +306,7 @@ def each_flow(
 
 
 def ends(values: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest (...) of values (...) that come one after the other."""
+    """Returns the least and largest (...) of values (...) that come one after the other."""
     rows = iter(values)
     low = np.array(next(rows))
     high = low.copy()
@@ -317,9 +319,9 @@ def ends(values: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 def error_percent(
     made: np.ndarray, on_off: np.ndarray, r: np.ndarray, missed: Missed
 ) -> tuple[float, float, float]:
-    """R.m.s. error of the flows `made` (M, T) in % of that of the flows of on-off control (M, T), member by
-    member: 90 % of what may come out lies between the first and the last, the middle of it beside them. Both
-    ends are widened by what may be wrong in all (`Missed.percent`)."""
+    """Returns low, median and high of the r.m.s. error of the flows `made` (M, T), in % of that of on-off
+    control's flows (M, T), member by member. 90 % of the possible outcomes lie between low and high. Both
+    ends are widened by the possible total error (`Missed.percent`)."""
     ratio = np.linalg.norm(made - r, axis=1) / np.maximum(np.linalg.norm(on_off - r, axis=1), 1e-12)
     low, median, high = (float(value) for value in 100 * np.quantile(ratio, QUANTILES))
     doubt = float(np.nan_to_num(missed.percent))
@@ -327,8 +329,8 @@ def error_percent(
 
 
 class PartWindow(NamedTuple):
-    """Neighbouring lines (L,) of a part, by their place in Lines, the event that is hardest there, and the
-    standard deviation of what may come out, in mm^3/s."""
+    """Neighbouring lines (L,) of a part, by their place in PrintedLines; the hardest event there; and the
+    standard deviation of the possible flows there, in mm^3/s."""
 
     lines: np.ndarray
     event: str
@@ -338,9 +340,9 @@ class PartWindow(NamedTuple):
 def windows(
     made: np.ndarray, r: np.ndarray, lines: PrintedLines, tool: int, *, sample_time_s: float
 ) -> tuple[PartWindow, ...]:
-    """The hardest Start, Corner and Stop of one tool's share of a part, in the order of the part: where what
-    may come out (M, T) for the wanted flow r (T,) differs most. Windows that overlap are one. Raises
-    ValueError if the tool prints nothing."""
+    """Returns the hardest Start, Corner and Stop of one tool's share of a part, in the order of the part.
+    These are the places where the possible flows (M, T) for the wanted flow r (T,) differ most. Windows that
+    overlap are joined. Raises ValueError if the tool prints nothing."""
     mine = np.flatnonzero(lines.tool == tool)
     if not len(mine) or not np.any(r > 0):
         raise ValueError(
@@ -359,7 +361,7 @@ def windows(
 
 
 def _around(lines: PrintedLines, mine: np.ndarray, time_s: float) -> np.ndarray:
-    """The run at time_s, or the one nearest to it, and its neighbours while all fits into WINDOW_S."""
+    """Returns the run at time_s, or the one nearest to it, with as many neighbours as fit into WINDOW_S."""
     begin, end = lines.begin_s[mine], lines.end_s[mine]
     first = last = int(np.argmin(np.maximum(begin - time_s, 0) + np.maximum(time_s - end, 0)))
     while first > 0 and lines.run[mine[first - 1]] == lines.run[mine[first]]:
@@ -374,7 +376,8 @@ def _around(lines: PrintedLines, mine: np.ndarray, time_s: float) -> np.ndarray:
 
 
 def _apart(found: Sequence[PartWindow]) -> tuple[PartWindow, ...]:
-    """Windows in their order, those that share a line as one, named by the harder event."""
+    """Returns the windows in their order. Windows that share a line are joined and named by the harder
+    event."""
     out: list[PartWindow] = []
     for window in sorted(found, key=lambda one: int(one.lines[0])):
         if out and window.lines[0] <= out[-1].lines[-1]:
@@ -388,9 +391,9 @@ def _apart(found: Sequence[PartWindow]) -> tuple[PartWindow, ...]:
 def verification_program(
     name: str, chosen: Sequence[PartWindow], lines: PrintedLines, tool: int, *, bead_area_mm2: float
 ) -> tuple[str, float]:
-    """The part program of the windows, and how long it prints in s: each line as long and as fast as in the
-    part (of one longer than two plateaus the ends), each pause and gap as long, along x; the nozzle goes on
-    through a gap."""
+    """Returns the part program of the windows, and its printing time in s. Along x each line is as long and
+    as fast as in the part (a line longer than two plateaus keeps only its ends), and each pause and gap as
+    long, a gap at most REST_S. The nozzle moves on through a gap."""
     text = [f"; verifies {name}, T{tool}: {', '.join(window.event for window in chosen)}"]
     text += ["; filament_diameter = 1.75", "G21", "G90", "M83", f"T{tool}", "G0 X0 Y0 Z0.3 F600"]
     x = y = duration = 0.0
@@ -419,7 +422,7 @@ def verification_program(
 
 
 def _shortened(length_mm: float, speed: float) -> float:
-    """The length that a line has in the print: both its ends."""
+    """Returns the length of a line in the print, which keeps both its ends."""
     return min(length_mm, 2 * PLATEAU_S * speed)
 
 
@@ -432,9 +435,9 @@ def next_command(
     drive: Drive,
     sample_time_s: float,
 ) -> np.ndarray:
-    """The command (T,) in mm after a print of the part with u (T,) whose flow was measured as y (T,), NaN
-    where it was not seen: u + SHARE P^-1 Q (r - y) with P the chain's gain, time constant and delays, and Q a
-    zero-phase low-pass (Bristow 2006, eq. 3); cut to what the drive can do."""
+    """Returns the command (T,) in mm after a print of the part with u (T,): u + SHARE P^-1 Q (r - y), cut to
+    what the drive can do. y (T,) is the measured flow, NaN where it was not observed. P is the chain's gain,
+    time constant and delays, and Q a zero-phase low-pass (Bristow 2006, eq. 3)."""
     lacked = np.where(np.isfinite(y), r - y, 0.0)
     smooth = ilc.zero_phase(lacked, order=ORDER, cutoff_hz=CUTOFF_HZ, sample_time_s=sample_time_s)
     late = extruder.delay_s + basis.mean_lag_s(extruder)
@@ -444,8 +447,8 @@ def next_command(
 
 
 def measured_percent(y: np.ndarray, on_off: np.ndarray, r: np.ndarray) -> float:
-    """R.m.s. error of a measured flow y (T,), NaN where it was not seen, in % of that of on-off control's
-    flow (T,) over the same samples. Raises ValueError if nothing was seen."""
+    """Returns the r.m.s. error of a measured flow y (T,), NaN where it was not observed, in % of that of
+    on-off control's flow (T,) over the same samples. Raises ValueError if nothing was observed."""
     seen = np.isfinite(y)
     if not seen.any():
         raise ValueError(

@@ -1,5 +1,5 @@
-"""The basis-signal library: learned commands cut into tasks on the smoothed signal, the nearest of them, and
-the four assumptions in figures (Hoelzle 2009)."""
+"""The basis-signal library (Hoelzle 2009): learned commands are cut into tasks, with limits found on the
+smoothed signal. Also finds the nearest signal for a task, and gives the four assumptions in figures."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ HOLD_S = 0.1
 
 
 class TooFewTrials(ValueError):
-    """More trials have to be printed before a library can be cut."""
+    """Raised if more trials must be printed before a library can be cut."""
 
 
 class Training(NamedTuple):
@@ -46,8 +46,8 @@ class Training(NamedTuple):
 
 
 class Basis(NamedTuple):
-    """One column of (3): `signal` (K,) in mm begins `lead` samples ahead of its
-    event. speed in mm/s; pause_s is 0 but for a Corner."""
+    """One column of (3): `signal` (K,) in mm, which begins `lead` samples before its event. speed in mm/s;
+    pause_s is 0 except for a Corner."""
 
     task: str
     material: str
@@ -59,8 +59,8 @@ class Basis(NamedTuple):
 
 
 class Library(NamedTuple):
-    """`columns` are the basis signals in the order of (3), `sample_time_s` their clock, `marks` the
-    demarcation of each task in s before and after its event."""
+    """`columns`: the basis signals in the order of (3); `sample_time_s`: their sample time; `marks`: the
+    limits of each task in s before and after its event."""
 
     columns: tuple[Basis, ...]
     sample_time_s: float
@@ -78,8 +78,8 @@ class Check(NamedTuple):
 
 
 def learned(training: Training) -> tuple[np.ndarray, np.ndarray]:
-    """Command (T,) of the best trial, by the error that repeats (`ilc.repeating_error`), and the measured
-    flow (T,) that learning ended with: means over the trials whose error is within a tenth of the lowest."""
+    """Returns the command (T,) of the best trial, by its repeating error (`ilc.repeating_error`), and the
+    final measured flow (T,): the mean over the trials whose error is within a tenth of the lowest."""
     error = np.array([repeating_error(training.r, y) for y in training.y])
     best = error <= 1.1 * error.min()
     observable = np.isfinite(training.y[best])
@@ -88,7 +88,7 @@ def learned(training: Training) -> tuple[np.ndarray, np.ndarray]:
 
 
 def smoothed(u: np.ndarray, sample_time_s: float) -> np.ndarray:
-    """u after the paper's Q filter: 2nd-order Butterworth low-pass, 3 Hz, forward and backward."""
+    """Returns u after the paper's Q filter: 2nd-order Butterworth low-pass, 3 Hz, forward and backward."""
     return scipy.signal.sosfiltfilt(scipy.signal.butter(2, 3.0, fs=1 / sample_time_s, output="sos"), u)
 
 
@@ -102,7 +102,7 @@ def _events(training: Training) -> dict[str, tuple[float, float]]:
 
 
 def plateaus(training: Training, sample_time_s: float) -> tuple[slice, slice]:
-    """The middle halves of the two plateaus."""
+    """Returns the middle halves of the two plateaus."""
     routine = training.routine
     ends = ((routine.start_s, routine.pause_s[0]), (routine.pause_s[1], routine.stop_s))
     return tuple(
@@ -112,19 +112,19 @@ def plateaus(training: Training, sample_time_s: float) -> tuple[slice, slice]:
 
 
 def _walk(active: np.ndarray, hold: int) -> int:
-    """Samples from the event until `active` stays False for `hold` samples; active (T,) begins at the event
-    and ends in the middle of the next plateau."""
+    """Returns the samples from the event until `active` is False for `hold` samples. active (T,) begins at
+    the event and ends in the middle of the next plateau."""
     quiet = np.convolve(~active, np.ones(hold))[hold - 1 : len(active)] == hold
     return int(np.argmax(quiet)) if quiet.any() else len(active)
 
 
 def demarcate(trainings: Sequence[Training], *, sample_time_s: float) -> dict[str, tuple[float, float]]:
-    """Seconds by which each finite task's signal begins before its event and ends after it, the same for all
-    materials, speeds and pauses: the widest found.
+    """Returns the seconds by which each finite task's signal begins before its event and ends after it. They
+    are the same for all materials, speeds and pauses: the widest found.
 
-    A task lasts while the smoothed command is off the level of the plateau beside it by more than max(2 % of
-    its peak, 3 sigma of the plateau). Raises ValueError if the plateaus are none: 3 sigma above 30 % of
-    the peak, or a task that lasts to the middle of its plateau.
+    A task lasts while the smoothed command differs from the level of the plateau beside it by more than max(2
+    % of its peak, 3 sigma of the plateau). Raises ValueError if the plateaus are not flat: if 3 sigma is
+    above 30 % of the peak, or a task lasts to the middle of its plateau.
     """
     marks = dict.fromkeys((START, CORNER, STOP), (0.0, 0.0))
     hold = max(1, round(HOLD_S / sample_time_s))
@@ -158,8 +158,8 @@ def demarcate(trainings: Sequence[Training], *, sample_time_s: float) -> dict[st
 def segment(
     training: Training, marks: dict[str, tuple[float, float]], *, sample_time_s: float
 ) -> list[Basis]:
-    """The five basis signals of one routine, cut from its learned command at the marks; Steady-State is the
-    mean of the plateaus, No-Flow zero."""
+    """Returns the five basis signals of one routine, cut from its learned command at the marks. Steady-State
+    is the mean of the plateaus, No-Flow is zero."""
     u = learned(training)[0]
     columns = []
     for task, event in _events(training).items():
@@ -176,8 +176,9 @@ def segment(
 
 
 def build(trainings: Sequence[Training], *, sample_time_s: float) -> Library:
-    """The library of all routines; a task that several routines taught (Start at one speed with two pauses)
-    is their mean: one task, one signal (assumption 3)."""
+    """Returns the library of all routines. If several routines taught a task (Start at one speed with two
+    pauses), its signal is their mean: one task, one signal (assumption 3). Raises ValueError if there is no
+    routine."""
     if not trainings:
         raise ValueError("library: expected at least one learned routine but found none; run train_ilc first")
     marks = demarcate(trainings, sample_time_s=sample_time_s)
@@ -193,23 +194,24 @@ def build(trainings: Sequence[Training], *, sample_time_s: float) -> Library:
 
 
 def _laid(basis: Basis, factor: float, level: float, lead: int, length: int) -> np.ndarray:
-    """The signal as deviation from the command that is there without it, `lead` samples before its event to
-    `length` after: the level before a Corner or a Stop, after a Start or a Corner."""
+    """Returns the signal as deviation from the command without the task, from `lead` samples before its event
+    to `length` after: without it, the command is at the level before a Corner or a Stop, and after a Start or
+    a Corner."""
     out, at = np.zeros(lead + length), lead - basis.lead
     out[at : at + len(basis.signal)] = factor * (basis.signal - background(basis, level))
     return out
 
 
 def background(basis: Basis, level: float) -> np.ndarray:
-    """The command (K,) that is there without the task: Steady-State at `level` after a
-    Start, before a Stop, and on both sides of a Corner."""
+    """Returns the command (K,) without the task: Steady-State at `level` after a Start, before a Stop, and on
+    both sides of a Corner; else 0."""
     after = np.arange(len(basis.signal)) >= basis.lead
     return level * np.select([basis.task == START, basis.task == STOP], [after, ~after], 1.0)
 
 
 def _unlike(a: Basis, b: Basis, per_speed: float) -> float:
-    """How unlike a, scaled to b's speed, is to b: r.m.s. of the difference over the larger of the two, both
-    as deviations from the steady command."""
+    """Returns how different a, scaled to b's speed, is from b: r.m.s. of the difference divided by the larger
+    of the two, both as deviations from the steady command."""
     if a.task in (STEADY, NO_FLOW):
         return abs(float(a.signal[0]) * b.speed / a.speed - float(b.signal[0])) / max(
             per_speed * b.speed, 1e-12
@@ -220,8 +222,8 @@ def _unlike(a: Basis, b: Basis, per_speed: float) -> float:
 
 
 def _slopes(columns: Sequence[Basis], per_speed: float) -> tuple[float, float]:
-    """Largest unlikeness per unit of |ln speed| and per second of pause among the columns of one task; NaN
-    where one speed or one pause is all there is."""
+    """Returns the largest difference (`_unlike`) per unit of |ln speed| and per second of pause among the
+    columns of one task; NaN if there is only one speed or one pause."""
     by_speed, by_pause = [math.nan], [math.nan]
     for a in columns:
         for b in columns:
@@ -233,8 +235,8 @@ def _slopes(columns: Sequence[Basis], per_speed: float) -> tuple[float, float]:
 
 
 def of_task(library: Library, task: str, material: str, nozzle_mm: float) -> list[Basis]:
-    """The columns of one task; a Corner of no pause is no event and
-    need not be trained: it is the Steady-State."""
+    """Returns the columns of one task. A Corner without a pause is no event and need not be trained: its
+    column is the Steady-State."""
     mine = [basis for basis in library.columns if (basis.material, basis.nozzle_mm) == (material, nozzle_mm)]
     still = [basis._replace(task=CORNER) for basis in mine if basis.task == STEADY] if task == CORNER else []
     return still + [basis for basis in mine if basis.task == task]
@@ -243,9 +245,9 @@ def of_task(library: Library, task: str, material: str, nozzle_mm: float) -> lis
 def nearest(
     library: Library, task: str, material: str, nozzle_mm: float, speed: np.ndarray, pause_s: np.ndarray
 ) -> tuple[list[Basis], np.ndarray, np.ndarray, np.ndarray]:
-    """For M tasks of `speed` (M,) in mm/s and `pause_s` (M,): the columns of the task, which of them is
-    nearest (M,), in pause first, for that is what scaling cannot make up for; the factor on its signal (M,),
-    and its predicted error in percent (M,)."""
+    """Returns, for M tasks of `speed` (M,) in mm/s and `pause_s` (M,): the columns of the task; the index
+    (M,) of the nearest one; the factor on its signal (M,); its predicted error in percent (M,). Nearest is
+    judged by pause first, because scaling cannot correct a wrong pause."""
     columns = of_task(library, task, material, nozzle_mm)
     still = of_task(library, STEADY, material, nozzle_mm)
     per_speed = float(np.mean([basis.signal[0] / basis.speed for basis in still]))
@@ -266,8 +268,8 @@ def nearest(
 
 
 def check(trainings: Sequence[Training], library: Library) -> list[Check]:
-    """Assumptions 1-4 as figures for each material and nozzle, in
-    percent: none is assumed, all are reported."""
+    """Returns the figures of assumptions 1-4 for each material and nozzle, in percent. No assumption is taken
+    as true; all are reported."""
     out, Ts = [], library.sample_time_s
     for key in sorted({(t.material, t.nozzle_mm) for t in trainings}):
         mine = [t for t in trainings if (t.material, t.nozzle_mm) == key]

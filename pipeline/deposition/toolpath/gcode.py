@@ -1,8 +1,9 @@
-"""G-code as it is found -> moves: the words of every dialect, and the state (units, modes, offsets, tools)
-resolved over whole columns instead of line by line.
+"""Reads G-code of every dialect into moves. The state (units, modes, offsets, tools) is resolved over whole
+columns instead of line by line.
 
-Three steps: bytes -> words (gcode_words), words -> commands, commands -> moves; a chunk of lines at a time,
-with the state handed on from chunk to chunk. What drives the extrusion is known when all was read.
+There are three steps: bytes -> words (gcode_words), words -> commands, commands -> moves. They run on one
+chunk of lines at a time and hand the state on to the next chunk. What drives the extrusion is known only when
+all chunks are read.
 """
 
 import collections
@@ -31,14 +32,14 @@ Kind = enum.IntEnum("Kind", "TRAVEL EXTRUDE WIPE RETRACT UNRETRACT PRIME DWELL T
 
 
 class Moves(NamedTuple):
-    """N moves in their order; start and end (N, 3) in mm are one chain from 0 0 0,
-    unbroken by G92, which renames places and moves nothing.
+    """N moves in their order. start and end (N, 3) in mm form one chain from 0 0 0. G92 does not break it,
+    because G92 renames places and moves nothing.
 
-    line: number from 1. length: mm along the path, arcs and helices by their true length. e: mm of filament
-    or plunger as programmed (mm^3 where M200 says so); mm of path where a switch drives extrusion. feed:
-    mm/s with M220's factor, NaN before the first F. tool: in use, for TOOL the new one. centre (N, 2) in mm
-    and angle in rad (+ counter-clockwise, whole turns included): of arcs, NaN and 0 for lines. dwell_s: of
-    DWELL. acceleration: mm/s^2 by M204 or SET_VELOCITY_LIMIT, NaN where the program gave none.
+    line: number from 1. length: mm along the path, with the true length of arcs and helices. e: mm of
+    filament or plunger as programmed (mm^3 if M200 says so); mm of path if a switch drives extrusion. feed:
+    mm/s with M220's factor, NaN before the first F. tool: the tool in use; for TOOL the new one. centre (N,
+    2) in mm and angle in rad (+ counter-clockwise, whole turns included): of arcs; NaN and 0 for lines.
+    dwell_s: of DWELL. acceleration: mm/s^2 by M204 or SET_VELOCITY_LIMIT, NaN if the program gave none.
     """
 
     line: np.ndarray
@@ -56,8 +57,8 @@ class Moves(NamedTuple):
 
 
 class OtherWord(NamedTuple):
-    """A word that is no move, told once: how often it stands there, its first line, and what becomes of it,
-    "" if nothing is known of it."""
+    """A word that is no move, reported once: how often it occurs, its first line, and how it is treated (""
+    if nothing is known of it)."""
 
     word: str
     count: int
@@ -66,8 +67,8 @@ class OtherWord(NamedTuple):
 
 
 class Accounted(NamedTuple):
-    """How many lines are empty or comment, move, only set something, hold words without meaning for moves,
-    and were refused; together all lines of the program."""
+    """Numbers of lines. `blank`: empty or comment; `moved`: move; `read`: only set something; `other`: hold
+    words without meaning for moves; `refused`: refused. Together they are all lines of the program."""
 
     blank: int
     moved: int
@@ -77,11 +78,13 @@ class Accounted(NamedTuple):
 
 
 class PartProgram(NamedTuple):
-    """The moves; words without meaning for them, in their order (other_line (M,), other_word (M,)); refusals,
-    one a kind; what drives the extrusion (E, U, A, M42 P4, ..., or nothing: "") and how many lines there are.
+    """The moves; the words without meaning for them, in their order (other_line (M,), other_word (M,)); the
+    refusals, one per kind; `extruder`: what drives the extrusion (E, U, A, M42 P4, ..., or "" for nothing);
+    the number of lines.
 
-    flow (N,): M221's factor on E. volumetric (N,): E counts mm^3 (M200). diameter_mm: of what E pushes, by
-    tool, as the program says it. refused_line (R,): every line that was refused.
+    flow (N,): M221's factor on E. volumetric (N,): whether E counts mm^3 (M200). diameter_mm: diameter of
+    what E pushes, by tool, as the program gives it. told: the other words, each once. refused_line (R,):
+    every refused line.
     """
 
     moves: Moves
@@ -148,14 +151,14 @@ DIAMETERS = (b"filament_diameter", b"filamentDiameters", b"fiber_dia_mm", b"Fila
 
 
 class Place(NamedTuple):
-    """One axis: the place as the program names it, and what G92 has shifted since the last G28."""
+    """The place on one axis: as the program names it, and the shift by G92 since the last G28."""
 
     named: float = 0.0
     shift: float = 0.0
 
 
 class ProgramState:
-    """What the lines so far leave in force for the next ones."""
+    """The state that the lines so far leave in force for the next lines."""
 
     def __init__(self) -> None:
         self.unit, self.motion, self.plane, self.tool = 1.0, 10, 170, 0
@@ -171,8 +174,8 @@ class ProgramState:
 
 
 class Commands(NamedTuple):
-    """C commands: line and key (G1 is 10, G92.1 is 921, M and T from their offsets on), the words by letter
-    in mm, NaN where absent, the number of words of each, and the letter that leads it."""
+    """C commands: line and key (G1 is 10, G92.1 is 921, M and T start at their offsets), the words by letter
+    in mm (NaN if absent), the number of words of each command, and the letter that leads it."""
 
     line: np.ndarray
     key: np.ndarray
@@ -182,9 +185,9 @@ class Commands(NamedTuple):
 
 
 class Gathered:
-    """What the chunks leave: columns of the moves, E by every letter and every switch that may drive the
-    extrusion, the lines of their words, and what else was found. Columns have room for a move a line, and
-    take memory only where they are written."""
+    """Everything collected from the chunks: the columns of the moves, E by every letter and every switch that
+    may drive the extrusion, the lines of their words, and all other words. The columns have room for one move
+    per line, and take memory only once they are written."""
 
     def __init__(self, lines: int) -> None:
         self.rows, self.room = 0, lines + 1
@@ -197,7 +200,8 @@ class Gathered:
         self.filled, self.words = 0, 0
 
     def add(self, columns: tuple[np.ndarray, ...], driven: dict[str, np.ndarray]) -> None:
-        """The moves of a chunk behind those before; what drives E is nothing where it was not seen."""
+        """Appends the moves of a chunk to those before. The column of a letter or switch is 0 in the chunks
+        without it."""
         self.columns = self.columns or [np.zeros((self.room, *c.shape[1:]), c.dtype) for c in columns]
         for name in driven.keys() - self.driven.keys():
             self.driven[name] = np.zeros(self.room, driven[name].dtype)
@@ -220,11 +224,11 @@ def _longer(column: np.ndarray, room: int) -> np.ndarray:
 
 
 def parse(text: str | bytes, *, extruder: str = "") -> PartProgram:
-    """The moves of a program, with all that was not understood beside them. `extruder` names what drives the
-    extrusion if the program leaves it open ("U", "M42 P4", ...).
+    """Reads the moves of a program, and lists all that was not understood. `extruder` names what drives the
+    extrusion ("U", "M42 P4", ...); if it is "", the program decides.
 
-    Raises ValueError, in one sentence, for what is no G-code text at all: binary, empty, or without a single
-    G, M or T word that can be read; and for an extruder that the program does not have.
+    Raises ValueError, in one sentence, if the text is no G-code at all: binary, empty, or without a single G,
+    M or T word that can be read. Raises ValueError also if the program does not have this extruder.
     """
     data, refusals, state = text_bytes(text), Refusals(), ProgramState()
     lines, state.cubic = data.count(b"\n"), CUBIC in data[:4096]
@@ -256,8 +260,8 @@ def parse(text: str | bytes, *, extruder: str = "") -> PartProgram:
 
 
 def _commands(words: ProgramWords, state: ProgramState, refusals: Refusals) -> Commands:
-    """G and M begin a command, but behind an M word that takes the whole line, and so does the word that
-    leads a line."""
+    """Splits the words into commands. A command begins at the first word of a line, and at each G or M word
+    unless an M word before it takes the whole line."""
     line, letter, value = words[:3]
     if np.any(letter == ord("N")):
         line, letter, value = (column[letter != ord("N")] for column in (line, letter, value))
@@ -287,7 +291,8 @@ def _commands(words: ProgramWords, state: ProgramState, refusals: Refusals) -> C
 
 
 def _pin_modes(letter: np.ndarray, value: np.ndarray, leads: np.ndarray) -> np.ndarray:
-    """Which words are the M0 to M3 of an M42 on their line: the mode of its pin, no command."""
+    """Returns which words are M0 to M3 after an M42 on the same line: these are the mode of its pin, not
+    commands."""
     m = letter == ord("M")
     modes = m & ~leads & np.isin(value, (0, 1, 2, 3))
     if modes.any():
@@ -299,8 +304,8 @@ def _pin_modes(letter: np.ndarray, value: np.ndarray, leads: np.ndarray) -> np.n
 def _with_words(
     commands: Commands, block, letter, value, state: ProgramState, refusals: Refusals
 ) -> Commands:
-    """The commands with their words; what stands twice, beside a word that takes none, or is not supported
-    is refused."""
+    """Returns the commands with their words. Refuses a letter that is given twice, a word beside a command
+    that takes none, a number far out of range, and an unsupported command."""
     line, key, word, words, lead = commands
     unit = _held(np.where(key == 200, 25.4, 1.0), np.isin(key, (200, 210)), state.unit)
     state.unit = float(unit[-1]) if len(unit) else state.unit
@@ -351,12 +356,13 @@ def _refuse(refusals: Refusals, line: np.ndarray, where: np.ndarray, why: str) -
 
 
 def _last(mask: np.ndarray) -> np.ndarray:
-    """Index of the last True up to each place, -1 before the first."""
+    """Returns the index of the last True up to each place, -1 before the first."""
     return np.maximum.accumulate(np.where(mask, np.arange(len(mask)), -1))
 
 
 def _held(values: np.ndarray, mask: np.ndarray, start) -> np.ndarray:
-    """The value at the last True of the mask, `start` before the first: what a modal word leaves in force."""
+    """Returns the value at the last True of the mask, `start` before the first: the value that a modal word
+    leaves in force."""
     return np.append(values, start)[_last(mask)]
 
 
@@ -368,7 +374,7 @@ def _none(word: dict[str, np.ndarray], letters: str) -> np.ndarray:
 
 
 def _gather(commands: Commands, state: ProgramState, refusals: Refusals, out: Gathered) -> None:
-    """The moves of a chunk of commands behind those before, with all that may turn out to drive E."""
+    """Appends the moves of a chunk of commands to those before, with every column that may drive E."""
     line, key, word, words, lead = commands
     if not len(key):
         return
@@ -411,7 +417,7 @@ def _gather(commands: Commands, state: ProgramState, refusals: Refusals, out: Ga
 
 
 def _tools(key, word, state: ProgramState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The tool in use, which commands select one, and which of them change it."""
+    """Returns the tool in use at each command, which commands select a tool, and which of them change it."""
     selects = (key >= T) & (key < T + 10 * TOOLS) | np.isin(key, (M + 60, M + 1350)) & np.isfinite(word["T"])
     asked = np.clip(np.nan_to_num(word["T"]), 0, T).astype(int)
     tool = _held(np.where(key >= T, (key - T) // 10, asked), selects, state.tool)
@@ -421,8 +427,8 @@ def _tools(key, word, state: ProgramState) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _place(value, adds, names, homes, sets, start: Place) -> tuple[np.ndarray, np.ndarray, Place]:
-    """Place on one axis before and after each command, and as the last one leaves it: the last value set plus
-    all that was added since, and all that G92 shifted since the last G28."""
+    """Returns the place on one axis before and after each command, and the state after the last command. A
+    place is the last value set, plus everything added since, plus all shifts by G92 since the last G28."""
     value = np.where(np.isfinite(value) & ~homes, value, 0.0)
     run = np.cumsum(np.where(adds, value, 0.0))
     after = _held(value, sets, start.named) + (run - _held(run, sets, 0.0))
@@ -435,8 +441,8 @@ def _place(value, adds, names, homes, sets, start: Place) -> tuple[np.ndarray, n
 
 
 def _driven(commands: Commands, motion, relative, bare, tool, state: ProgramState) -> dict[str, np.ndarray]:
-    """E of each command by each letter that may drive the extrusion. E counts for each tool apart; G91 makes
-    it relative too, until an M82."""
+    """Returns the E of each command for each letter that may drive the extrusion. E is counted for each tool
+    separately. G91 makes E relative too, until an M82."""
     _, key, word, _, _ = commands
     modes = np.isin(key, (M + 820, M + 830))
     by_word = _held(key == M + 830, modes, state.e_relative)
@@ -459,7 +465,7 @@ def _driven(commands: Commands, motion, relative, bare, tool, state: ProgramStat
 
 
 def _switched(key, word, state: ProgramState, refusals: Refusals, line) -> dict[str, np.ndarray]:
-    """Whether each switch is on, by its name; M42 by its pin."""
+    """Returns whether each switch is on at each command, by its name; M42 by its pin."""
     columns = {}
     for name, (on, off) in SWITCHES.items():
         switch = np.isin(key, M + 10 * np.array(on + off))
@@ -488,7 +494,8 @@ def _pin(number: float) -> str:
 
 
 def _pace(key, word, motion, dwell, state: ProgramState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Feed in mm/s with M220's factor on it, acceleration in mm/s^2, and what each dwell takes in s."""
+    """Returns the feed in mm/s with M220's factor, the acceleration in mm/s^2, and the duration of each dwell
+    in s."""
     plain = _held(word["F"] / 60, motion & (word["F"] > 0), state.feed)
     events, factor = key == M + 2200, np.ones(len(key))
     speed = state.speed
@@ -507,7 +514,7 @@ def _pace(key, word, motion, dwell, state: ProgramState) -> tuple[np.ndarray, np
 
 
 def _flow(key, word, tool, state: ProgramState) -> tuple[np.ndarray, np.ndarray]:
-    """M221's factor on E, and whether E counts mm^3 (M200), for the tool of each command."""
+    """Returns M221's factor on E, and whether E counts mm^3 (M200), for the tool of each command."""
     flow, volumetric = np.ones(len(key)), np.zeros(len(key), bool)
     named = np.where(np.isfinite(word["T"]), word["T"], tool)
     percent = (key == M + 2210) & (word["S"] >= 0)
@@ -529,7 +536,8 @@ def _flow(key, word, tool, state: ProgramState) -> tuple[np.ndarray, np.ndarray]
 
 
 def _words_left(commands: Commands, motion: np.ndarray, meant: np.ndarray, out: Gathered) -> None:
-    """Words that are no moves, letters beside moves, and words that may turn out to switch or to drive."""
+    """Adds to `out` the words that are no moves, the letters beside moves, and the words that may turn out to
+    switch or to drive the extrusion."""
     line, key, word, _, lead = commands
     switching = np.isin(key, SWITCHING)
     left = np.flatnonzero(~(np.isin(key, MEANT) | meant | switching) & (key != REFUSED))
@@ -562,7 +570,8 @@ _cached_name = functools.cache(_name)
 
 
 def _moved(out: Gathered, asked: str) -> tuple[Moves, tuple[str, ...], np.ndarray, np.ndarray]:
-    """The moves of all chunks, what drives their extrusion, M221's factor and M200's mode of each."""
+    """Returns the moves of all chunks, the names that drive their extrusion, and for each move M221's factor
+    and M200's mode."""
     line, start, end, length, feed, tool, centre, angle, pause, acceleration, flow, volumetric = (
         column[: out.rows] for column in out.columns[:12]
     )
@@ -584,8 +593,9 @@ def _moved(out: Gathered, asked: str) -> tuple[Moves, tuple[str, ...], np.ndarra
 
 
 def _driver(driven: dict[str, np.ndarray], planar: np.ndarray, asked: str) -> tuple[str, ...]:
-    """What drives the extrusion: what `asked` names, else E where it grows along the path, else the other
-    letters that do, else a switch that is on along some of the path, else a letter that moves alone."""
+    """Returns the names that drive the extrusion: those that match `asked`; if it is "", E if it grows along
+    the path; else the other letters that do; else a switch that is on along some of the path; else a letter
+    that moves alone. Raises ValueError if nothing matches `asked`."""
     letters = [c for c in DRIVERS if c in driven]
     if asked:
         found = [name for name in driven if name == asked or name.split()[0] == asked]
@@ -611,7 +621,8 @@ def _shown(driver: tuple[str, ...]) -> str:
 
 
 def _kinds(what: np.ndarray, planar: np.ndarray, vertical: np.ndarray, e: np.ndarray) -> np.ndarray:
-    """The kind (N,) of each move by where it goes and what E does, behind what its word says."""
+    """Returns the kind (N,) of each move. It follows from where the move goes and what E does, unless the
+    command's word gives the kind."""
     out, back = e > TINY, e < -TINY
     # retracted so far: -sum E, but never below nothing, so that printing empties it
     depth = np.cumsum(-e)
@@ -628,7 +639,7 @@ def _kinds(what: np.ndarray, planar: np.ndarray, vertical: np.ndarray, e: np.nda
 
 
 def _told(others: list[tuple[int, str]], out: Gathered, driver: tuple[str, ...]) -> list[OtherWord]:
-    """Every word that is no move, once, the most frequent first."""
+    """Returns every word that is no move, once, the most frequent first."""
     counts = collections.Counter(word for _, word in others)
     first: dict[str, int] = {}
     for line, word in others:
@@ -644,7 +655,8 @@ def _told(others: list[tuple[int, str]], out: Gathered, driver: tuple[str, ...])
 
 
 def _accounted(lines: int, filled: int, moved, other, refused) -> Accounted:
-    """Every line once: refused before moved before told before read."""
+    """Counts every line once. A line that fits several counts is, in this order, refused, moved, other or
+    read."""
     moved = np.setdiff1d(moved, refused)
     other = np.setdiff1d(np.setdiff1d(other, refused), moved)
     held = len(refused) + len(moved) + len(other)
@@ -652,7 +664,8 @@ def _accounted(lines: int, filled: int, moved, other, refused) -> Accounted:
 
 
 def _said(data: bytes) -> dict[int, float]:
-    """Diameter in mm of what E pushes, by tool, as a slicer's comment says it."""
+    """Returns the diameter in mm of what E pushes, by tool, from a slicer's comment; empty if there is
+    none."""
     for words in DIAMETERS:
         at = data.find(words)
         line = data[data.rfind(b"\n", 0, at) + 1 : data.find(b"\n", at)] if at >= 0 else b""
@@ -677,9 +690,9 @@ def _arcs(
     state: ProgramState,
     refusals: Refusals,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centre (N, 2), signed angle, length (N,) of all commands; the length of a refused arc is
-    NaN. I J point to the centre from the start; R is the radius, < 0 the long way round; P counts
-    turns, 1 being no more than one (LinuxCNC and Bambu)."""
+    """Returns centre (N, 2), signed angle and length (N,) of all commands; the length of a refused arc is
+    NaN. I J point from the start to the centre. R is the radius; if R < 0, the arc goes the long way round. P
+    counts turns; P1 adds none (LinuxCNC and Bambu)."""
     line, key, word = commands[:3]
     step = end - start
     centre, angle, length = np.full((len(step), 2), np.nan), np.zeros(len(step)), np.linalg.norm(step, axis=1)

@@ -1,7 +1,8 @@
-"""Bytes of a part program -> words (line, letter, value), chunk by chunk, whatever their dialect or damage.
+"""Reads the bytes of a part program into words (line, letter, value), chunk by chunk, for every dialect and
+in spite of damage.
 
-Lines made of letters with numbers are read together, eight digits in three multiplications;
-the few others (macros, free text, checksums) one by one.
+Lines made of letters with numbers are read together, eight digits in three multiplications. The few others
+(macros, free text, checksums) are read one by one.
 """
 
 import functools
@@ -14,8 +15,8 @@ import numpy as np
 
 
 class LineRefusal(NamedTuple):
-    """Commands that were left out for one reason, because they could not be read or ask for what is not
-    supported: the first line, the reason found there, and how many lines."""
+    """Commands that were left out for one reason, because they could not be read or are not supported: the
+    first line, the reason found there, and the number of lines."""
 
     line: int
     why: str
@@ -26,7 +27,8 @@ NUMBERS = dict.fromkeys(map(ord, "0123456789."))  # what tells two reasons of on
 
 
 class Refusals:
-    """What was refused so far: by kind of reason its first line and sentence, and all lines' numbers."""
+    """The refusals so far: for each kind of reason its first line and sentence; and the numbers of all
+    refused lines."""
 
     def __init__(self) -> None:
         self.kinds: dict[str, LineRefusal] = {}
@@ -42,7 +44,8 @@ class Refusals:
         self.lines += lines
 
     def grouped(self) -> list[LineRefusal]:
-        """One refusal a kind by its first line; the sentence says how many more lines are like it."""
+        """Returns one refusal per kind, ordered by first line. The sentence gives the number of further lines
+        like it."""
         more = [
             one._replace(why=f"{one.why} (and {one.count - 1:,} more such)") if one.count > 1 else one
             for one in self.kinds.values()
@@ -51,8 +54,8 @@ class Refusals:
 
 
 class ProgramWords(NamedTuple):
-    """The words of some lines, all (W,): line from 1, letter as its capital's code, value; words of odd lines
-    that mean nothing to moves as (line, word); and how many lines hold more than comments."""
+    """The words of some lines, all (W,): line from 1, letter as its capital's code, value. `others`: words
+    without meaning for moves, as (line, word); `filled`: the number of lines that hold more than comments."""
 
     line: np.ndarray
     letter: np.ndarray
@@ -94,8 +97,8 @@ ENOUGH = 20_000  # lines without one word, behind which no G-code is expected an
 
 
 def text_bytes(text: str | bytes) -> bytes:
-    """The bytes with every line ended by one newline; what is not ASCII can only stand in comments and free
-    text. Raises ValueError for what is binary."""
+    """Returns the bytes with every line ended by one newline. Characters beyond ASCII can only occur in
+    comments and free text. Raises ValueError if the text is binary."""
     if isinstance(text, bytes) and text[:2] in (b"\xff\xfe", b"\xfe\xff"):
         text = text.decode("utf-16", "replace")
     data = (
@@ -118,8 +121,8 @@ def text_bytes(text: str | bytes) -> bytes:
 
 
 def chunks(data: bytes, refusals: Refusals) -> Iterator[ProgramWords]:
-    """The words of the program, some CHUNK bytes of whole lines at a time. Raises ValueError if no line
-    of the first ENOUGH that hold anything has a G, M or T word that can be read."""
+    """Yields the words of the program, about CHUNK bytes of whole lines at a time. Raises ValueError if the
+    first ENOUGH lines that hold anything have no G, M or T word that can be read."""
     at, first, found, filled = 0, 1, False, 0
     while at < len(data):
         end = data.find(b"\n", min(at + CHUNK, len(data) - 1)) + 1
@@ -140,8 +143,8 @@ def chunks(data: bytes, refusals: Refusals) -> Iterator[ProgramWords]:
 
 
 def no_program(data: bytes, lines: int, refusals: Refusals, which: str = "") -> ValueError:
-    """Why the first `lines` lines of a program hold no G, M or T word: what was refused of the first line
-    that begins with one, or that none does."""
+    """Returns the error that the first `lines` lines of a program hold no G, M or T word. It gives the
+    refusal of the first line that begins with such a word, or says that no line does."""
     begun = BEGUN.search(data)
     line = data.count(b"\n", 0, begun.start()) + 1 if begun else lines + 1
     if begun and line <= lines and line in refusals.lines:
@@ -160,7 +163,7 @@ def no_program(data: bytes, lines: int, refusals: Refusals, which: str = "") -> 
 
 
 def _shorter(body: bytes, first: int, refusals: Refusals) -> tuple[bytes, int]:
-    """The lines, with those that are too long refused and left empty, and how many these are."""
+    """Returns the lines, with those that are too long refused and emptied, and the number of these."""
     lines = body.split(b"\n")
     long = [k for k, line in enumerate(lines) if len(line) > LONGEST]
     for k in long:
@@ -170,7 +173,7 @@ def _shorter(body: bytes, first: int, refusals: Refusals) -> tuple[bytes, int]:
 
 
 def _chunk(body: bytes, first: int, refusals: Refusals) -> tuple[ProgramWords, int]:
-    """Words of a chunk of whole lines, and the number of its lines."""
+    """Returns the words of a chunk of whole lines, and the number of its lines."""
     columns, odd, count = _regular(body, first)
     line, extra, others = columns[0], [], []
     filled = len(odd) + (int(np.count_nonzero(np.diff(line))) + 1 if len(line) else 0)
@@ -191,8 +194,8 @@ def _chunk(body: bytes, first: int, refusals: Refusals) -> tuple[ProgramWords, i
 
 
 def _regular(body: bytes, first: int) -> tuple[list[np.ndarray], np.ndarray, int]:
-    """Line, letter and value of the words of all lines that hold only letters, each with a number right
-    behind it; the indices of the other lines; the number of lines."""
+    """Returns line, letter and value of the words of all lines that hold only letters directly followed by a
+    number; the indices of the other lines; the number of lines."""
     kinds = np.frombuffer(body.translate(CLASSES), np.uint8)
     events = np.flatnonzero(
         kinds - np.uint8(1) < 4
@@ -238,8 +241,8 @@ def _regular(body: bytes, first: int) -> tuple[list[np.ndarray], np.ndarray, int
 
 
 def _digits(eight: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """The number written by the first `count` (0 to 8) of eight digits in a little-endian word: pairs, then
-    fours, then all eight (Lemire 2018)."""
+    """Returns the number written by the first `count` (0 to 8) of eight digits in a little-endian word:
+    pairs, then fours, then all eight (Lemire 2018)."""
     w = (eight << (64 - 8 * np.clip(count, 0, 8)).astype(np.uint64)) & 0x0F0F0F0F0F0F0F0F
     w = (w * 10 + (w >> 8)) & 0x00FF00FF00FF00FF
     w = (w * 100 + (w >> 16)) & 0x0000FFFF0000FFFF
@@ -247,8 +250,8 @@ def _digits(eight: np.ndarray, count: np.ndarray) -> np.ndarray:
 
 
 def _odd(text: str) -> tuple[list[tuple[str, float]], str, str]:
-    """Words of a line that holds more than letters with numbers; its leading word where that means nothing to
-    moves; why it could not be read."""
+    """Returns the words of a line that holds more than letters with numbers; its leading word if that means
+    nothing to moves, else ""; why it could not be read, else ""."""
     text, why = _checked(text.strip())
     text, host = map(str.strip, text.partition("@")[::2])
     host = "@" + host.split()[0][:40] if host else ""
@@ -288,7 +291,8 @@ def _odd(text: str) -> tuple[list[tuple[str, float]], str, str]:
 
 
 def _exponent(text: str, words: Sequence[tuple[str, float]]) -> str:
-    """Why a command with two words E cannot be read, where one of them is an exponent without a sign."""
+    """Returns why a command with two words E cannot be read, if one of them is an exponent without a sign;
+    else ""."""
     found = list(UNSIGNED.finditer(text)) if sum(letter == "E" for letter, _ in words) > 1 else []
     if not found:
         return ""
@@ -299,8 +303,9 @@ def _exponent(text: str, words: Sequence[tuple[str, float]]) -> str:
 
 
 def _checked(text: str) -> tuple[str, str]:
-    """The line without its number and its checksum, the exclusive or of all bytes before the asterisk; why it
-    fails. Five digits are a CRC, which is not checked."""
+    """Returns the line without its number and its checksum, and why the checksum fails, "" if it does not.
+    The checksum is the exclusive or of all bytes before the asterisk. Five digits are a CRC, which is not
+    checked."""
     body, star, digits = text.rpartition("*")
     if star and digits.strip().isdecimal() and text[0] in "NGTngt":
         checksum = functools.reduce(operator.xor, body.encode("latin-1"), 0)

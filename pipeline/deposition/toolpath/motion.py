@@ -1,5 +1,5 @@
-"""Moves -> the gantry's travel in time: trapezoids of speed with look-ahead, corners by junction deviation,
-arcs by their true length, as firmware plans them."""
+"""Moves -> the gantry's travel in time, as firmware plans it: trapezoids of speed with look-ahead, corners by
+junction deviation, arcs by their true length."""
 
 from typing import NamedTuple
 
@@ -12,14 +12,14 @@ MOST = 50_000_000  # samples of one signal, 11 days at 50 Hz: beyond it a feed o
 
 
 class Motion(NamedTuple):
-    """The plan of N moves: each speeds up from `entry` to `cruise` in
-    ramp_s[0], cruises, and slows down to `exit` in ramp_s[1].
+    """The plan of N moves: each speeds up from `entry` to `cruise` in ramp_s[0], cruises, and slows down to
+    `exit` in ramp_s[1].
 
-    begin_s, duration_s (N,): when a move begins and how long it takes. entry, cruise, exit (N,): mm/s
-    along the path, of filament where E moves alone. ramp_s (2, N): seconds of speeding up and of
-    slowing down. acceleration (N,): mm/s^2. travel (N,): mm along the path, of filament where E moves
-    alone. turn (N,): angle in rad by which the path turns where the move begins (0 straight on, pi
-    back), NaN where it or the move before stands still.
+    begin_s, duration_s (N,): when a move begins and how long it takes. entry, cruise, exit (N,): mm/s along
+    the path, of filament if E moves alone. ramp_s (2, N): seconds of speeding up and of slowing down.
+    acceleration (N,): mm/s^2. travel (N,): mm along the path, of filament if E moves alone. turn (N,): angle
+    in rad by which the path turns at the begin of the move (0 straight on, pi back), NaN if this move or the
+    one before has no travel.
     """
 
     begin_s: np.ndarray
@@ -34,8 +34,8 @@ class Motion(NamedTuple):
 
 
 class MotionSignal(NamedTuple):
-    """The plan at t = 0, Ts, 2 Ts, ... to its end: position (T, 3) in mm, speed (T,) in mm/s (0 where E moves
-    alone), the move (T,) and the share (T,) of its way that is done."""
+    """The plan at t = 0, Ts, 2 Ts, ... to its end: position (T, 3) in mm, speed (T,) in mm/s (0 if E moves
+    alone), the move (T,) and the share (T,) of it that is done."""
 
     time_s: np.ndarray
     position: np.ndarray
@@ -54,17 +54,17 @@ def plan(
     tool_change_s: float,
     printing_acceleration: float = np.inf,
 ) -> Motion:
-    """The fastest motion within the limits: each move's feed, speed_limit in mm/s, acceleration in mm/s^2
-    (the program's own where that is lower), and at corners
+    """Returns the fastest motion within the limits: each move's feed, speed_limit in mm/s, acceleration in
+    mm/s^2 (the program's own if that is lower), and at corners
 
-    v^2 <= a delta s / (1 - s),   v^2 <= a l s / (2 c),   s = sin(theta / 2), c = cos(theta / 2)
+        v^2 <= a delta s / (1 - s),   v^2 <= a l s / (2 c),   s = sin(theta / 2), c = cos(theta / 2)
 
     with theta the angle between the legs (pi straight on), delta the junction deviation (Jeon, "Improving
     grbl: cornering algorithm", 2011) and l the shorter leg (Klipper's bound for curves in short legs). Arcs
     keep v^2 <= a r. Dwells, tool changes (tool_change_s) and E alone begin and end at rest; unset_feed (mm/s)
-    is for moves before the first F. Where a printing_acceleration in mm/s^2 is given, moves that print speed
-    up and slow down no faster, and begin and end at rest beside moves that do not. Raises ValueError for
-    limits that are not positive.
+    is for moves before the first F. If a printing_acceleration in mm/s^2 is given, printing moves speed up
+    and slow down no faster than that. They then begin and end at rest next to moves that do not print. Raises
+    ValueError for limits that are not positive.
     """
     limits = {"acceleration": acceleration, "speed_limit": speed_limit, "unset_feed": unset_feed}
     limits |= {"printing_acceleration": printing_acceleration}
@@ -102,7 +102,7 @@ def plan(
 
 
 def _radius(moves: Moves) -> np.ndarray:
-    """Mean radius (N,) of the arcs, NaN for lines."""
+    """Returns the mean radius (N,) of the arcs, NaN for lines."""
     return (
         np.linalg.norm(moves.start[:, :2] - moves.centre, axis=1)
         + np.linalg.norm(moves.end[:, :2] - moves.centre, axis=1)
@@ -110,8 +110,8 @@ def _radius(moves: Moves) -> np.ndarray:
 
 
 def _turns(moves: Moves, runs: np.ndarray) -> np.ndarray:
-    """Angle (N,) between the direction in which the move before ends and the one in which
-    this one begins, NaN where either stands still."""
+    """Returns the angle (N,) between the direction in which the previous move ends and the one in which this
+    move begins, NaN if either has no travel."""
     step = moves.end - moves.start
     turn = np.full(len(step), np.nan)
     pair = np.flatnonzero(runs[1:] & runs[:-1])
@@ -133,7 +133,7 @@ def _turns(moves: Moves, runs: np.ndarray) -> np.ndarray:
 
 
 def _corner(turn: np.ndarray, length: np.ndarray, a: np.ndarray, deviation: float) -> np.ndarray:
-    """v^2 (N,) with which each move may begin: theta = pi - turn."""
+    """Returns v^2 (N,) with which each move may begin: theta = pi - turn."""
     s, c = np.maximum(np.cos(turn / 2), 0.0), np.sin(turn / 2)
     lower = np.minimum(a, np.append(a[:1], a[:-1]))
     leg = np.minimum(length, np.append(length[:1], length[:-1]))
@@ -145,10 +145,10 @@ def _corner(turn: np.ndarray, length: np.ndarray, a: np.ndarray, deviation: floa
 
 
 def _look_ahead(cap: np.ndarray, gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """v^2 (N,) where each move begins and ends: min over all places k of cap_k + |sum of the gains 2 a l from
-    here to there|, rest after the last.
+    """Returns v^2 (N,) at the begin and at the end of each move: min over all places k of cap_k + |sum of the
+    gains 2 a l from here to there|, with rest after the last.
 
-    That is the backward pass and the forward pass of a planner in closed form, a running minimum each.
+    That is the backward pass and the forward pass of a planner in closed form, each as a running minimum.
     """
     cap, way = np.append(cap, 0.0), np.append(0.0, np.cumsum(gain))
     v = np.minimum.accumulate((cap + way)[::-1])[::-1] - way
@@ -158,8 +158,8 @@ def _look_ahead(cap: np.ndarray, gain: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def sampled(motion: Motion, moves: Moves, *, sample_time_s: float, rates_only: bool = False) -> MotionSignal:
-    """The plan at t = 0, Ts, 2 Ts, ..., the last at most one Ts before its end; with `rates_only` no more
-    than `rate` needs, move and share, the other columns empty. Raises ValueError if that is more than MOST
+    """Returns the plan at t = 0, Ts, 2 Ts, ..., the last at most one Ts before its end. With `rates_only`
+    only the columns that `rate` needs are filled, move and share. Raises ValueError for more than MOST
     samples."""
     end = motion.begin_s + motion.duration_s
     if len(end) and end[-1] > MOST * sample_time_s:
@@ -187,7 +187,7 @@ def sampled(motion: Motion, moves: Moves, *, sample_time_s: float, rates_only: b
 def _at(
     motion: Motion, moves: Moves, move: np.ndarray, time_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Position (T, 3), speed (T,) and share (T,) of its way of each move (T,) at time_s (T,)."""
+    """Returns position (T, 3), speed (T,) and done share (T,) of each move (T,) at time_s (T,)."""
     since = time_s - motion.begin_s[move]
     left = motion.duration_s[move] - since
     up, down, cruise, a = (
@@ -221,8 +221,8 @@ def _on_arc(moves: Moves, move: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 def rate(signal: MotionSignal, amount: np.ndarray, *, sample_time_s: float) -> np.ndarray:
-    """Mean rate (T,) from each instant to the next of an amount (N,) that each move spends evenly along its
-    way (E, volume, printed length); sums exactly.
+    """Returns the mean rate (T,) from each instant to the next of an amount (N,) that each move spends evenly
+    along its way (E, volume, printed length). The sum is exact.
 
     An amount of a move without travel is spent at its end.
     """

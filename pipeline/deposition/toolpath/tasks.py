@@ -1,5 +1,5 @@
-"""Moves and their motion -> the sequence of tasks, with look-ahead: runs, corners, gaps, changes of material;
-the rules of what may follow what (Hoelzle 2009, fig. 8)."""
+"""Moves and their motion -> the sequence of tasks, with look-ahead: runs, corners, gaps, changes of material.
+Also checks which task may follow which (Hoelzle 2009, fig. 8)."""
 
 from collections.abc import Collection
 from typing import NamedTuple
@@ -22,12 +22,12 @@ STEP_S = 0.02
 
 class PrintedLines(NamedTuple):
     """Every printed line (L,): its number in the program, its move, its tool, the run that it belongs to,
-    begin and end in s, length in mm, cruising speed in mm/s. Where the gantry takes STEP_S or longer from
-    rest to that speed, the line begins in the middle, early_s after it sets out, and ends late_s before it
-    rests.
+    begin and end in s, length in mm, cruising speed in mm/s. If the gantry takes STEP_S or longer from rest
+    to that speed, the line begins in the middle of that ramp, early_s after the gantry starts, and ends
+    late_s before it rests.
 
-    first and last tell whether it begins or ends its run; pause_s is the time lost at the junction after it
-    (halts in place and slowing down), and corner whether that is a Corner.
+    first and last: whether it begins or ends its run; pause_s: the time lost at the junction after it (halts
+    in place and slowing down); corner: whether that junction is a Corner.
     """
 
     line: np.ndarray
@@ -47,8 +47,8 @@ class PrintedLines(NamedTuple):
 
 
 class Tasks(NamedTuple):
-    """The sequence (N,): name of the task, tool, number of the line that calls for it, its event and its end
-    in s, speed in mm/s, pause in s (of a Corner)."""
+    """The sequence (N,): name of the task, tool, number of the line that needs it, its event and its end in
+    s, speed in mm/s, pause in s (of a Corner)."""
 
     task: np.ndarray
     tool: np.ndarray
@@ -60,11 +60,11 @@ class Tasks(NamedTuple):
 
 
 def printed_lines(moves: Moves, motion: Motion, *, corner_deg: float, longest_pause_s: float) -> PrintedLines:
-    """The printed lines, joined to runs where nothing but a halt in place of at
-    most `longest_pause_s` lies between two of one tool.
+    """Returns the printed lines. Two lines of one tool belong to one run if only a halt in place of at most
+    `longest_pause_s` lies between them.
 
-    A junction is a Corner where the path turns by `corner_deg` or more, or
-    halts. Raises ValueError if nothing is printed.
+    A junction is a Corner if the path turns by `corner_deg` or more, or if the gantry halts there. Raises
+    ValueError if nothing is printed.
     """
     at = np.flatnonzero((moves.kind == Kind.EXTRUDE) & (moves.length > 0))
     if not len(at):
@@ -112,11 +112,11 @@ def printed_lines(moves: Moves, motion: Motion, *, corner_deg: float, longest_pa
 
 
 def sequence(lines: PrintedLines, *, end_s: float) -> Tasks:
-    """The tasks in their order: No-Flow, then for each run Start, Steady-State, (Corner, Steady-State)...,
-    Stop, and No-Flow or, to another tool, Dwell.
+    """Returns the tasks in their order: No-Flow, then for each run Start, Steady-State, (Corner,
+    Steady-State)..., Stop, and No-Flow or, before another tool, Dwell.
 
-    A task's event is where the gantry begins it, or is in the middle of its ramp: the signals are sent ahead
-    of it by their leads, which is what looking ahead is for.
+    A task's event is when the gantry begins it, or is in the middle of its ramp. The signals are sent earlier
+    by their leads, which needs looking ahead.
     """
     switched = np.append(lines.tool[1:] != lines.tool[:-1], False)
     flat = lines.first | np.concatenate([[False], lines.corner[:-1]])
@@ -147,12 +147,12 @@ def sequence(lines: PrintedLines, *, end_s: float) -> Tasks:
 
 
 def refuse(lines: PrintedLines, moves: Moves, *, halts: Collection[int], switch_s: float) -> None:
-    """Raises ValueError, with the line number, if a program would have
-    to go from Steady-State to No-Flow without a Stop:
+    """Raises ValueError, with the line number, if a program would have to go from Steady-State to No-Flow
+    without a Stop.
 
-    a change of material with less than `switch_s` between the last line of the one and the
-    first of the other (the rest of Stop A and the lead of Start B), and a halt (line
-    numbers `halts`, see `halting`) in the middle of a run.
+    There are two cases: a change of material with less than `switch_s` between the last line of the one and
+    the first of the other (the rest of Stop A and the lead of Start B), and a halt (line numbers `halts`, see
+    `halting`) in the middle of a run.
     """
     after = np.flatnonzero(
         (lines.tool[1:] != lines.tool[:-1]) & (lines.begin_s[1:] - lines.end_s[:-1] < switch_s - TINY_S)
@@ -181,7 +181,7 @@ def refuse(lines: PrintedLines, moves: Moves, *, halts: Collection[int], switch_
 
 
 def halting(other_line: np.ndarray, other_word: np.ndarray) -> np.ndarray:
-    """The line numbers (H,) of words at which the machine waits for a person."""
+    """Returns the line numbers (H,) of words at which the machine waits for a person or ends."""
     return np.array(
         [
             line
