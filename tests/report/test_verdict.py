@@ -188,7 +188,8 @@ def test_a_pass_on_nine_plants_in_ten_names_the_margins_that_the_worst_plant_lac
     verdict = judge(stages)
     assert verdict.state == PASSED
     assert verdict.reason.replace("\u202f", " ").endswith(
-        "Below the limit on the worst plant: disk margin 0.18 (limit 0.40), delay margin 0.41 s (limit 1.00 s)."
+        "Below the limit on the worst plant: disk margin 0.18 (limit 0.40), "
+        "delay margin 0.41 s (limit 1.00 s)."
     )
 
 
