@@ -1,6 +1,5 @@
-"""Clocks that do not run forward: what can be put right without a guess is, and is counted; `check_clock`
-refuses the rest.
-"""
+"""Repairs clocks that do not run forward if no guess is needed, and counts the repairs; `check_clock` refuses
+the rest."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -28,14 +27,14 @@ Repaired = tuple[FileColumns, np.ndarray, list[Note]]
 
 
 def repair(path: Path, group: FileColumns, *, may_restart: bool) -> Repaired:
-    """The columns on a clock that runs forward.
+    """Returns the columns on a clock that runs forward, the rows at which it had started over, and notes.
 
-    An hour that the end of summer time repeats on a clock without zone is counted on. One that starts over
-    goes on behind what was before, and its first row is a restart. Stamps of whole seconds with several rows
-    each are spread evenly. A few late rows are sorted back. Of rows with one time the first stays: exact
-    repeats are dropped, and a few others.
+    The hour that the end of summer time repeats on a clock without zone is counted on. A clock that starts
+    over continues after the last time before, and its first row is a restart. Stamps of whole seconds with
+    several rows each are spread evenly. A few late rows are sorted back. Keeps the first row of each
+    timestamp and drops the others: exact repeats, and at most a few that differ.
 
-    Raises ValueError with the place where that is not enough.
+    Raises ValueError with the place if that is not enough.
     """
     time = group.time
     if len(time) < 2 or (time[1:] > time[:-1]).all() or not np.isfinite(time).all():
@@ -51,10 +50,11 @@ def repair(path: Path, group: FileColumns, *, may_restart: bool) -> Repaired:
 
 
 def repair_topics(path: Path, groups: Sequence[FileColumns], *, one_clock: bool) -> list[Repaired]:
-    """`repair` for the groups of a recording, which start over together.
+    """Returns the results of `repair` for the groups of a recording, which start over together.
 
-    Each must have started over as often. Where they have not `one_clock`, the recorder's, the stretches
-    between must also agree in start and end, as a clock that one device alone set back would not.
+    Every group must have started over equally often. If they do not share `one_clock`, the recorder's, the
+    stretches between restarts must also agree in start and end. They would not if only one device had set
+    back its clock.
     """
     if len(groups) == 1:
         return [repair(path, groups[0], may_restart=True)]
@@ -75,7 +75,7 @@ def repair_topics(path: Path, groups: Sequence[FileColumns], *, one_clock: bool)
 
 
 def _forward(path: Path, group: FileColumns, restarts: np.ndarray, notes: list[Note]) -> Repaired:
-    """Stamps that share a second spread, late rows sorted back, repeats dropped; checked."""
+    """Spreads stamps that share a second, sorts late rows back, drops repeats, and checks the clock."""
     group = group._replace(time=_distribute_stamps(group, restarts, notes))
     order = _forward_rows(group, notes)
     columns = _rows(group, order)
@@ -94,7 +94,7 @@ def _note(kind: str, rows: np.ndarray, place: Callable[[int], str], message: str
 
 
 def _interval(time: np.ndarray) -> float:
-    """The median of the intervals that run forward."""
+    """Returns the median of the intervals that run forward."""
     steps = np.diff(time)
     return float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
 
@@ -104,7 +104,7 @@ def _few(rows: int, total: int) -> bool:
 
 
 def _summer_time(group: FileColumns, notes: list[Note]) -> np.ndarray:
-    """The times with an hour added behind each fall by an hour, on a calendar without zone."""
+    """Returns the times, with an hour added after each fall by an hour, if the calendar has no zone."""
     time = group.time
     if time.dtype != np.int64 or group.zone:
         return time
@@ -120,7 +120,7 @@ def _summer_time(group: FileColumns, notes: list[Note]) -> np.ndarray:
 
 
 def _restarts(time: np.ndarray) -> np.ndarray:
-    """The indices of the rows at which a clock starts over."""
+    """Returns the indices of the rows at which a clock starts over."""
     starts, restarts = _falls(time), []
     if not len(starts) or not np.isfinite(time).all():
         return np.empty(0, int)
@@ -147,8 +147,8 @@ def _restart_note(group: FileColumns, rows: np.ndarray) -> Note:
 
 
 def _going_on(times: Sequence[np.ndarray], restarts: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The times of each group, in which a stretch begins one interval behind the one before; all groups by
-    the same."""
+    """Returns the times of each group. Each stretch begins one interval after the end of the previous one.
+    All groups are shifted equally."""
     shifted = [time.copy() for time in times]
     interval = np.asarray(max(_interval(time) for time in times)).astype(times[0].dtype)
     views = [np.split(time, rows) for time, rows in zip(shifted, restarts, strict=True)]
@@ -160,7 +160,7 @@ def _going_on(times: Sequence[np.ndarray], restarts: Sequence[np.ndarray]) -> li
 
 
 def _agree(groups: Sequence[FileColumns], restarts: Sequence[np.ndarray]) -> bool:
-    """Whether the stretches of all groups begin and end within a few intervals of each other."""
+    """Returns whether the stretches of all groups begin and end within a few intervals of each other."""
     tolerance = AGREE_INTERVALS * max(_interval(group.time) for group in groups)
     ends = np.array(
         [
@@ -172,10 +172,10 @@ def _agree(groups: Sequence[FileColumns], restarts: Sequence[np.ndarray]) -> boo
 
 
 def _distribute_stamps(group: FileColumns, restarts: np.ndarray, notes: list[Note]) -> np.ndarray:
-    """Times of rows that share a stamp of whole seconds, spread evenly over it.
+    """Returns the times, with rows that share a stamp of whole seconds spread evenly over it.
 
-    Nearly every second must hold as many rows, and the rows must not be exact repeats nor take turns between
-    two courses, as those of two devices do.
+    This is done only if nearly every second has equally many rows. The rows must not be exact repeats or
+    alternate between two courses, as those of two devices do.
     """
     time = group.time
     begins = np.r_[True, np.diff(time) != 0]
@@ -203,7 +203,7 @@ def _distribute_stamps(group: FileColumns, restarts: np.ndarray, notes: list[Not
 
 
 def _repeats(group: FileColumns) -> np.ndarray:
-    """Mask (n - 1,) of the rows that are the row before once more."""
+    """Returns a mask (n - 1,) of the rows that repeat the previous row."""
     repeats = group.time[1:] == group.time[:-1]
     for column in group.values.values():
         repeats &= (column[1:] == column[:-1]) | (np.isnan(column[1:]) & np.isnan(column[:-1]))
@@ -211,7 +211,7 @@ def _repeats(group: FileColumns) -> np.ndarray:
 
 
 def _take_turns(group: FileColumns, place: np.ndarray, rows: int) -> bool:
-    """Whether some column goes up at one place of each stamp and down at another."""
+    """Returns whether some column goes up at one place of each stamp and down at another."""
     for column in group.values.values():
         change = np.diff(column)
         shares = [
@@ -225,8 +225,8 @@ def _take_turns(group: FileColumns, place: np.ndarray, rows: int) -> bool:
 
 
 def _forward_rows(group: FileColumns, notes: list[Note]) -> np.ndarray:
-    """Indices of the rows in the order of time, without those whose time another one has. All rows where too
-    many would move or be left out."""
+    """Returns the indices of the rows in the order of time, one for each time. Returns all rows if too many
+    would have to be moved or dropped."""
     time = group.time
     order = rows = np.arange(len(time))
     lateness = np.maximum.accumulate(time) - time
@@ -258,7 +258,7 @@ def _forward_rows(group: FileColumns, notes: list[Note]) -> np.ndarray:
 
 
 def check_clock(path: Path, group: FileColumns) -> None:
-    """Raises ValueError with the place if a time is missing, repeated or before the one ahead of it."""
+    """Raises ValueError with the place if a time is missing, repeated or earlier than the previous one."""
     time = group.time
     missing = np.flatnonzero(~np.isfinite(time))
     if len(missing):
@@ -286,7 +286,7 @@ def check_clock(path: Path, group: FileColumns) -> None:
 
 
 def _remedy(group: FileColumns, steps_s: np.ndarray, back: np.ndarray) -> str:
-    """The remedy for a clock that stands still or runs backwards, by the way it does."""
+    """Returns the remedy for a clock that stands still or runs backwards, by the way it does so."""
     step = steps_s[back[0]]
     remedies = (
         (step == 0, "name a finer clock, or give each device or tag that writes here a column of its own"),

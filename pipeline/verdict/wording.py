@@ -50,7 +50,8 @@ def worded(question: Question, value: float, places: int) -> str:
 
 
 def banded(question: Question, figure: Figure, places: int) -> str:
-    """Returns the band of a figure, "" if it has none or if one of its ends says nothing."""
+    """Returns the band of a figure, with an end in words if its digits say nothing; "" if both ends are the
+    same."""
     ends = worded(question, figure.low, places), worded(question, figure.high, places)
     if OFF_THE_SCALE in ends or any(map(math.isinf, (figure.low, figure.high))):
         return "" if ends[0] == ends[1] else " to ".join(ends).replace("never settles", "never")
