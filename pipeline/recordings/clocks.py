@@ -10,19 +10,20 @@ import numpy as np
 from pipeline.recordings.formats import FileColumns, Note
 
 HOUR_S = 3600
-# a clock that runs on for no more than so many samples before it falls back is not one clock
+# if a clock falls back after every few samples (this many on average, or fewer), it is not a single clock
 OTHER_DEVICE_RUN = 8
-# rows that came late, or had a time that another one has: more than that is another device, or no clock
+# most rows that came late or repeat a time: if there are more, they are from another device, or it is no
+# clock
 FEW_SHARE, FEW_ROWS_OF = 0.02, 10
-# a row that came late is no more than so many behind
+# a late row is at most this many rows behind
 LATEST_ROWS = 8
-# stretches between restarts that begin and end within so many intervals are of one clock
+# stretches between restarts are of one clock if they begin and end within this many intervals
 AGREE_INTERVALS = 3
-# seconds that hold as many rows each, but one; and rows that take turns between two courses
+# fewest stamps, share of seconds with equally many rows (one more or less), share of rows that alternate
 LEAST_STAMPS, ALIKE_SHARE, TURNS_SHARE = 4, 0.9, 0.8
 
 
-# columns whose time runs forward, the indices of the rows at which the clock had started over, and notes
+# columns with time running forward, the indices of the rows at which the clock had started over, and notes
 Repaired = tuple[FileColumns, np.ndarray, list[Note]]
 
 
@@ -127,7 +128,7 @@ def _restarts(time: np.ndarray) -> np.ndarray:
     ends, first, latest = np.r_[starts[1:], len(time)], time[0], time[starts[0] - 1]
     for start, end in zip(starts, ends, strict=True):
         run = time[start:end]
-        # late rows are a few, and soon followed by the one that was due
+        # late rows are few, and the row that was due soon follows
         if run[0] <= first or np.searchsorted(run, latest) > LATEST_ROWS:
             restarts.append(int(start))
             first, latest = run[0], run[-1]

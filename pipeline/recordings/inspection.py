@@ -42,7 +42,7 @@ from pipeline.recordings.proposals import (
 from pipeline.recordings.quality import quantisation_step
 from pipeline.recordings.resampling import GAP_INTERVALS, intervals
 
-# numbers of a topic, and columns of a table, that are described; the others are counted
+# most numbers of a topic, and most columns of a table, that are described; the others are only counted
 MOST_FIELDS, MOST_SIGNALS = 64, 128
 CODE = "missing code"  # kind of the note on numbers that stand for a missing value
 _NO_TIME = (
@@ -182,7 +182,7 @@ def _table(path: Path, columns: Sequence[FileColumn], has_clock: bool, read: _Re
     if untimed:
         notes.append(Note("clock", "", 1, _NO_TIME))
     notes += _unit_note(clock, group)
-    # a second time beside the clock is no signal
+    # a second time column is no signal
     values = {
         name: column
         for name, column in group.values.items()

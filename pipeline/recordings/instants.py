@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-# a clock is steady where no step is longer than so many medians, and there are so many; steps within a date
-# are the same in either order, and so many of them do
+# a clock is steady if it has at least FEWEST_STEPS and none is longer than STEADY medians. Steps within a
+# date are the same in either order, so FIRST_STEPS of them are enough
 STEADY, FEWEST_STEPS, FIRST_STEPS = 1.5, 5, 1000
 DAY_NS = 86_400 * 10**9
 _EPOCH = datetime.date(1970, 1, 1).toordinal()
@@ -34,9 +34,9 @@ _TEXT = re.compile(
 _PARTS = ("date", "hours", "minutes", "seconds", "fraction", "half", "zone")
 # 20251121130000 and 20251121130000250, as controllers stamp
 _COMPACT = re.compile(r"\s*((?:19|20)\d\d(?:0[1-9]|1[0-2])[0-3]\d)([0-2]\d)([0-5]\d)([0-5]\d)(\d{3})?\s*$")
-# what stands behind the seconds and a hyphen: a fraction as the camera program of CAXTON writes it, or a zone
+# the digits after the seconds and a hyphen: a fraction as in CAXTON's camera program, or a zone
 _HYPHEN = re.compile(r"(:\d\d)-(\d{1,6})\s*$")
-# zones by the letters that programs write behind a time; each says whether it is summer
+# zones by the letters that programs write after a time; each says whether it is summer
 _ZONE_HOURS = {
     "UTC": 0, "GMT": 0, "WET": 0, "WEST": 1, "BST": 1, "CET": 1, "CEST": 2, "MEZ": 1, "MESZ": 2,
     "EET": 2, "EEST": 3, "MSK": 3, "JST": 9, "KST": 9, "AEST": 10, "AEDT": 11,

@@ -23,9 +23,9 @@ if sys.platform != "win32":
 
 ROOT = Path(__file__).parents[2]
 _LENGTH = struct.Struct("<Q")
-# a child that keeps so much behind a call is replaced: the next call has its whole budget
+# a child that still holds this much after a call is replaced, so the next call has its whole budget
 KEPT_MB = 256
-# what C++, Python and Arrow print last where memory is refused them; Arrow then ends the process
+# the last words of C++, Python and Arrow if they get no memory; Arrow then ends the process
 OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "Out of memory", "memory allocation of")
 # the child's own code; -P: a folder `pipeline` in the working directory is not ours
 _SERVE = "from pipeline.recordings.isolated import serve; serve()"
@@ -73,7 +73,7 @@ def isolated(work: Callable[..., Any], *arguments: Any, shown: str | Path, budge
     except ValueError:
         reply = {}
     finally:
-        # also where a person ends the run: a child at its work is not left behind
+        # also if a person stops the run, so that no working child remains
         ended = (0, "")
         if reply.get("ready"):
             _waiting.append(child)
@@ -110,7 +110,7 @@ def _take() -> Child:
 def _end(child: Child) -> tuple[int, str]:
     """Ends a child. Returns its exit status, and the last line that it printed."""
     with contextlib.suppress(subprocess.TimeoutExpired):
-        # one that ended by itself has closed its pipes before it can be waited for
+        # a child that ended by itself closes its pipes a moment before wait() returns
         child.process.wait(timeout=1)
     child.process.kill()
     with contextlib.suppress(BrokenPipeError), child.process as process:

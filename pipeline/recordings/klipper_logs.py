@@ -22,12 +22,12 @@ from pipeline.recordings.printed_gcode import Print, PrintRows, PrintSignals
 # Stats lines have some 1,500 characters; a longer line is no line of Klipper's
 LONGEST_LINE = 1 << 16
 MOST_DEVICES = 200
-# how often the size of what was read is looked at
+# the size of the table is checked after every this many lines
 LINES_A_CHECK = 10_000
 LONGEST_CONFIG = 20_000
-# sessions whose order in time is not known stand so far apart, in s: no gap limit joins them
+# sessions in unknown order are placed this far apart, in s, so that no gap limit joins them
 APART_S = 3600.0
-# Klipper divides its PID parameters by this: they are of a duty of 0 to 255
+# Klipper divides its PID parameters by this, because they are for a duty of 0 to 255
 PID_BASE = 255.0
 _STATS = (b"Stats", b"INFO:root:Stats")
 LATEST_S = 4e9  # the year 2096: beyond it a system time is none, and no count runs on so long
@@ -183,7 +183,8 @@ class _Log:
         self.first_garbled = self.first_undated = 0
         self.prints: list[Print] = []
         self.is_printing, self.is_over, self.position, self.opened = False, False, -1, ("", -1)
-        # of each row: buffer_time, position in the printed file, index of the print, whether it is being read
+        # for each row: buffer_time, position in the printed file, index of the print, whether it is being
+        # read
         self.buffers, self.positions = array("d"), array("q")
         self.print_index, self.reads = array("q"), array("b")
 
@@ -218,7 +219,7 @@ class _Log:
         elif finished:
             self.is_over = True  # the position follows
         elif what == b"Start":
-            # a print that goes on after a pause starts at the position where it stopped
+            # a print that continues after a pause starts at the position where it stopped
             if not (self.is_printing and int(position) == self.position and self.prints[-1].end < 0):
                 self._start_print(line, int(position))
             self.position = int(position)
@@ -267,7 +268,7 @@ class _Log:
         if not 0 <= time < LATEST_S:
             self._count_garbled(line)
             return
-        # a count that falls without a start is another run, pasted behind
+        # a count that falls without a start is another run, pasted after this one
         if self.times and time < self.times[-1] and self.sessions[-1].first < len(self.times):
             self.sessions.append(_Session(len(self.times), np.nan))
             self.is_printing, self.position = False, -1

@@ -60,7 +60,7 @@ def load_matlab(path: Path) -> WholeTable:
             count += numbers.size
             check_values(path, count, 1)
             arrays[name] = numbers.squeeze()
-    # the length that most arrays have along their longest side; of equally many the longer
+    # the length that most arrays have along their longest side; the longer one if equally many have it
     lengths = [max(array.shape) for array in arrays.values() if array.ndim in (1, 2) and array.size]
     length = max(lengths, key=lambda length: (lengths.count(length), length), default=0)
     if length < 2:

@@ -14,7 +14,7 @@ FEWEST = 2  # a code repeats exactly
 LARGEST_SHARE = 0.5
 # a signal of fewer levels is a plan, a state or a set-point, in which 85 is as good as any
 FEWEST_LEVELS = 12
-# a code is further from the values around it than so many of their own largest steps
+# a code differs from its neighbours by more than this many of the signal's largest steps
 JUMP_OVER_STEPS = 3.0
 # the signal itself may be near the code now and then
 JUMPING_SHARE = 0.85

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-# a file that has not changed for so long is complete
+# a file that has not changed for this long is complete
 REST_S = 10.0
 # endings of downloads and copies, an open workbook's lock, and what systems leave in folders
 _PARTIAL_ENDS = (".part", ".partial", ".crdownload", ".download", ".filepart")
@@ -67,8 +67,8 @@ def _link(path: Path, top: Path) -> Iterator[str]:
         yield f"{path} is a link to {os.readlink(path)}, which is not there; remove the link"
         return
     if not target.is_relative_to(top):
-        # a folder of datasets/raw is the whole of a loop's recordings; those of images come by the hundred
-        # thousand, and their reader follows links to folders
+        # a folder of datasets/raw holds all recordings of a loop. Images come by the hundred thousand, and
+        # their reader follows links to folders
         whole_loop = path.parent.resolve() == top and top.name == "raw"
         if target.is_dir() and (whole_loop or path.parent.name == "setpoint"):
             yield from _problems(path, target)

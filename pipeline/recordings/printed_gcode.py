@@ -40,13 +40,14 @@ UNITS = {FAN: "percent", FEED: "mm/s"}
 NOT_RECORDED, LEFT_OUT = "printed_file", "gcode"
 SUFFIXES = (".gcode", ".g", ".gco")
 FOLDER = "gcodes"  # beside the log, as Moonraker calls it
-# G-code files that are looked at, bytes that are read of all of them, and the largest history
+# most G-code files that are searched, most bytes read from all of them together, and the largest history in
+# bytes
 MOST_FILES, MOST_BYTES, LARGEST_HISTORY = 1000, 1 << 29, 1 << 25
 BLOCK = 1 << 20  # a longer line is no command
-# positions of a print that are held against the ends of a file's lines, and the share that must agree
+# most positions of a print that are compared with the ends of a file's lines, and the share that must agree
 MOST_POSITIONS, AGREEING_SHARE = 2000, 0.99
 FEWEST_POSITIONS = 10  # so many positions tell a file without its name
-# a job of the history begins within so many s of its print
+# a job of the history begins within this many s of its print
 SAME_START_S = 10.0
 FILAMENT_TOLERANCE = 0.05
 LONGEST_MOVE_MM = 1e5  # a line that feeds more is damaged
@@ -323,7 +324,7 @@ def _choose(
     fitting = [path for path in candidates if not misfits[path]]
     if name and (len(positions) < FEWEST_POSITIONS or any(path in fitting for path in named)):
         fitting = [path for path in fitting if path in named]
-    # copies of one file are one
+    # copies of one file count once
     fitting = [p for i, p in enumerate(fitting) if not any(filecmp.cmp(p, q, False) for q in fitting[:i])]
     if len(fitting) == 1:
         return fitting[0], ""

@@ -15,7 +15,7 @@ from pipeline.recordings.instants import instants, over_midnight
 # a temperature store holds twenty minutes, some 100 kB
 LARGEST_JSON = 1 << 25
 LONGEST_LINE = 1 << 14
-# how often the size of what was read is looked at
+# the size of the table is checked after every this many reports
 LINES_A_CHECK = 10_000
 # Moonraker's lists -> name, unit, factor; one entry a second
 _LISTS = {

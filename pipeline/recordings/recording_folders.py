@@ -30,7 +30,7 @@ _GROWING = "is still being written; wait until its copy is complete and run it a
 # notes of rows that a reader left out
 _LEFT_OUT = ("truncated", "trailing", "damage")
 CODE = Path(__file__).parents[1]
-# what decides what an entry of the memo holds: changed code reads everything again
+# the code that decides the content of a memo entry; if it changes, everything is read again
 READING = ("store/artifacts.py", "store/params.py", "store/tables.py", "recordings/*.py")
 
 
@@ -255,7 +255,7 @@ def _one(path: Path, shown: Path, folder: Path, key: str, wish: RecordingWish, m
             if flagged.kind == "mixed" and table.masked[flagged.signal].mean() > 0.5:
                 raise ValueError(f"{path}: {flagged.message}")
     except ValueError as reason:
-        # on a cluster the path is absolute; what is said is the same wherever the work is done
+        # on a cluster the path is absolute; the message must be the same wherever the work is done
         return " ".join(str(reason).split()).replace(str(path), str(shown))
     findings = [(f.kind, f.signal, f.start_s, f.end_s, f.count, f.message) for f in table.flags]
     findings += [

@@ -54,7 +54,7 @@ __all__ = [
 
 
 FAHRENHEIT = {"degf", "°f", "° f", "℉", "f", "fahrenheit"}
-# at the end of a column's name; an F without brackets is as well the sixth zone
+# at the end of a column's name; an F without brackets could also be the sixth zone
 _NAMES_FAHRENHEIT = re.compile(r"(?:[\[(]F[\])]|(?:[\[(_ ](?:deg[Ff]|[Ff]ahrenheit)|°\s?F|℉)[\])]?)$")
 
 

@@ -9,15 +9,15 @@ import numpy as np
 from pipeline.recordings.formats import Flag, Jitter, Raw, Table
 from pipeline.recordings.quality import alternate, mask_mixed
 
-# a sample within that share of the sample time from the grid is on it: a temperature's change in a hundredth
-# of a sample is far below any sensor's step
+# a sample within this share of the sample time from the grid counts as on it, because a temperature changes
+# in a hundredth of a sample by far less than any sensor's step
 ON_GRID = 0.01
 GAP_INTERVALS = 3.0
-# commands are sent periodically if nearly all of their intervals are alike; else they are events, and a long
-# silence is no gap
+# commands are periodic if nearly all of their intervals are alike. Otherwise they are events, and a long
+# pause is no gap
 PERIODIC_SHARE = 0.95
 JITTER_SHARE, JITTER_OFTEN = 0.1, 0.01
-# a recording of which more than that was left out is a finding, % of its rows or samples
+# a recording is flagged if more than this was left out, % of its rows or samples
 MOST_CUT_PERCENT = 5.0
 
 
@@ -31,11 +31,11 @@ class _Clock(NamedTuple):
     jitter: Jitter | None
 
 
-# the samples of a clock beside each t_k: the indices of the first behind it and of the nearest, and how far
-# that is, each (T,); and the k without a sample on t_k
+# the samples of a clock beside each t_k: the indices of the next sample and of the nearest one, and the
+# distance of the nearest, each (T,); and the k without a sample on t_k
 _Neighbours = tuple[np.ndarray, np.ndarray | slice, np.ndarray, np.ndarray]
 # the t_k from which a command of a clock acts, for each of its n samples: k, how late that is, and whether it
-# counts, as one between two samples of a segment does
+# counts (a command between two samples of a segment does)
 _Effect = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -201,7 +201,7 @@ def _pieces(raw: Raw, clocks: Sequence[_Clock], sample_time_s: float) -> list[tu
         last = np.r_[cuts, len(clock.time_s) - 1]
         starts, ends = clock.time_s[np.r_[0, cuts + 1]], clock.time_s[last].astype(float)
         if np.isinf(clock.gap_limit_s):
-            # the last event holds on, up to where the clock starts over
+            # the last event remains in effect until the clock starts over
             ends = np.nextafter(np.r_[breaks, np.inf], -np.inf)[restarts[last]]
         stretches = list(zip(starts.tolist(), ends.tolist(), strict=True))
         pieces = _common(pieces, stretches, sample_time_s * ON_GRID)

@@ -45,7 +45,7 @@ _UNITS = {
     ),
 }
 _BRACKET = re.compile(r"[\[({<]\s*([^\[\](){}<>]+?)\s*[\])}>]")
-# a unit of one letter stands in brackets, or is a temperature's behind _ or a number
+# a unit of one letter is in brackets, or is a temperature's after _ or a number
 _TAIL = re.compile(
     r"(?:(?:^|[\s_,;./-])(?:in\s+)?|(?<=\d))("
     r"°\s?[ckf]|℃|deg[ _]?[cf]|celsius|kelvin|fahrenheit|pct|percent|prozent|rpm|upm|[u1r]/min|min-1|tr/min|"
@@ -114,13 +114,13 @@ SET_POINT = _pattern(
     "requested preset consign* csg cons deseado* deseada* objetivo objectif impost* obiettivo riferimento "
     "nominal* gewenst* ingesteld* zadan* tset"
 )
-# what is measured of it
+# the measured value
 ACTUAL = _pattern(
     "ist istw* *istwert* isttemp* istdreh* istleist* [tn]ist tempist actual* act tempact zoneact pv cpv "
     "process_val* measur* meas mess* gemess* mesur* medid* medicion misur* reale? actuel* attual* actueel "
     "reading current_val* current_temp* akt aktuell* rueckm* feedback fbk tact tmeas"
 )
-# what a controller gives: a word of its own, and one that can also mean a place
+# a controller's output: words that mean only this, and words that can also mean a place
 DUTY = _pattern(
     "stell* *stellgr* *stellwert* lmn op cv mv duty *pwm* power pwr *leistung* puiss* potenz* potenc* pot "
     "einschaltd* tastgrad tastverh* aussteuer* manipulat* wop ssr moc vermogen heat_out* out_heat "
@@ -145,7 +145,7 @@ PLACE = _pattern(
     "die werkzeug* filiere filiera matriz adapt* flansch* flange bed *bett cama piatto plateau hot_end* "
     "tool chamber* *kammer mou?ld moule molde stampo manifold hot_runner heisskanal melt z"
 )
-# what turns, blows or conveys: by its own words, or by a device that may have heaters too
+# speed and flow: words for the quantity, and words for devices that may also have heaters
 SPEED = _pattern(
     "drehz* *drehzahl* speed* *speed rpm upm umdreh* giri vitesse* velocid* velocit* vel *geschw* snelh* "
     "toerent* regime fan fans *fan *luefter* *geblaese* ventilat* ventilad* ventol* blower *durchsatz* "
@@ -158,7 +158,7 @@ MOVER = _pattern(
     "*pump* pomp* bomba spindle spindel valve* ventil* vanne* valvula* valvola* agit* mixer vfd* freq* "
     "*umrichter inverter plunger* piston* kolben* hopper"
 )
-# temperatures that no controller holds: of the surroundings, and of devices
+# temperatures that are not controlled: of the surroundings, and of devices
 ROOM = _pattern(
     "room* *raum* umgeb* ambi* amb hallen* aussen* outdoor outside exter* estern* sala stanza habitacion "
     "omgeving environment* env enclosure werkstatt workshop coolant *wasser* water* eau agua acqua air "
@@ -170,7 +170,7 @@ DEVICE = _pattern(
     "*motor* moteur* oil *oel huile aceite olio *lager bearing* inverter *umrichter* psu battery hydrau* "
     "dew* taupunkt*"
 )
-# limits, settings, modes, counts; and quantities of which no temperature's model is made
+# limits, settings, modes, counts; and quantities that no temperature model uses
 SETTING = _pattern(
     "*alarm* allarm* limit* *grenz* lim hihi lolo max* min maximum minimum kp ki kd tn tv xp gain "
     "*regelabw* deviation *abweich* ecart scarto desviacion error* fehler* auto* manu* mode modo "

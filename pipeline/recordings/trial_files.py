@@ -25,13 +25,13 @@ from pipeline.store.params import Mapped
 from pipeline.store.tables import BYTES, FLOAT, NONE, TEXT, Column, Schema
 
 SCHEMA, VERSION = "beadline.trial", "1"
-# what a trial has, where our own recordings have it
+# the signals of a trial, and their topics in our own recordings
 POSITION = Source("position_mm", "/gantry:position_mm", "mm")
 SPEED = Source("speed_mm_per_s", "/gantry:speed_mm_per_s", "mm/s")
 COMMAND = Source("command_mm", "/plunger:displacement_mm", "mm")
 FLOW = Source("flow_mm3_per_s", "/true_flow:flow_mm3_per_s", "mm^3/s")
 SOURCES = (POSITION, SPEED, COMMAND, FLOW)
-# of recordings, in which no trial is read
+# endings of recordings that are not read as trials
 OTHER_FORMATS = {".avi", ".bag", ".csv", ".db3", ".mkv", ".mov", ".mp4", ".parquet"}
 TYPES = {
     "/gantry": "beadline_msgs/msg/Gantry",

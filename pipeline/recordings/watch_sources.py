@@ -27,14 +27,14 @@ from pipeline.recordings.messages import Channel, Decode, decoder, fields, plain
 from pipeline.recordings.nozzle_frames import Topics
 
 PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
-# a picture that is not whole and has not grown for so long is broken
+# an incomplete picture that has not grown for this long is broken
 SETTLE_S = 2.0
-# between two looks at a folder or a recording
+# pause between two looks at a folder or a recording
 LOOK_S = 0.05
-# of one snapshot: seconds to wait for it, and bytes that are read
+# for one snapshot: longest wait in seconds, and most bytes that are read
 TIMEOUT_S, LARGEST_PICTURE = 2.0, 32 << 20
 COPY = "the frame is a copy of the one before"
-# what a printer can be told; beyond it a number of a recording is no setpoint
+# the range of a printer's settings; a number beyond it is no setpoint
 PLAUSIBLE = {"flow_percent": (0.0, 1000.0), "temperature_degC": (0.0, 600.0)}
 
 
@@ -116,7 +116,7 @@ class Folder:
                 with contextlib.suppress(OSError):  # a camera may remove its oldest
                     about = os.stat(os.path.join(root, name))
                     yield inside, about.st_mtime_ns, about.st_size
-        # a folder of very many names is looked through less often
+        # a folder with very many files is searched less often
         self.rest_s = max(LOOK_S, 5 * (time.monotonic() - began))
 
     def _picture(self, name: str, time_s: float, size: int) -> CameraFrame | None:
@@ -377,7 +377,7 @@ def _without_secret(parts: urllib.parse.SplitResult) -> str:
     return parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl()
 
 
-# `frames` gives what came since it was last asked; `waits_for` says why nothing comes, "" if something may;
-# `lacks` what a source that is there has none of; `ended`: nothing more will come; `rest_s`: how long to wait
-# before the next look
+# `frames` yields the new frames since the last call; `waits_for`: why no frame can come, "" if one may;
+# `lacks`: what an existing source does not contain; `ended`: nothing more will come; `rest_s`: how long to
+# wait before the next call
 FrameSource = Folder | RecordingSource | Snapshots

@@ -11,7 +11,7 @@ from pipeline.verdict.digits import band, beyond_meaning, decimals, declared, qu
 from pipeline.verdict.verdict import Figure, Missing, Question
 
 OFF_THE_SCALE = "off the scale"
-# what an infinite figure is called
+# words for an infinite figure
 INFINITE = {"settling": "never settles", "disk": "unlimited", "delay_s": "unlimited", "data": "unlimited"}
 MOST_PLACES = 6
 
@@ -80,7 +80,7 @@ def words_of(question: Question, figure: Figure, name: str) -> dict[str, Any]:
     sentence for a figure without digits."""
     places = places_of(question, [figure])
     value = worded(question, figure.value, places)
-    # a limit too small for the figure's decimals has its own
+    # a limit too small for the figure's decimals is shown with its own decimals
     exact = (
         places
         if math.isinf(question.limit) or round(question.limit, places) or not question.limit
