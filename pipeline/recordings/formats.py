@@ -1,6 +1,5 @@
-"""Recognises the format of a recording. Holds what all formats share: the records that are passed from a file
-to the learners, columns on a clock, the choice of the time column, and tables small enough to be read
-whole."""
+"""Recognises the format of a recording. Holds what all formats share: records passed from a file to the
+learners, columns on a clock, the choice of the time column, and tables small enough to be read whole."""
 
 import collections
 import difflib

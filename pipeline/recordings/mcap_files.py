@@ -102,8 +102,9 @@ def _note(name: str, count: int = 1, **values: Any) -> Note:
 
 
 class Messages(NamedTuple):
-    """Messages of one channel in the order of the file: times in ns, the bytes of each message (empty if the
-    channel is not wanted), and the offsets of the chunks, or of the single messages, that hold them."""
+    """Messages of one channel in the order of the file. `log_time`: ns; `publish_time` (ns) and `data`: both
+    lists are empty if the channel is not wanted; `offsets`: of the chunks, or of the single messages, that
+    hold them."""
 
     log_time: list[int]
     publish_time: list[int]

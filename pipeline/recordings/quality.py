@@ -454,9 +454,9 @@ def least_change(values: np.ndarray, lag: int = 1) -> float:
 
 
 def _alive(changes: np.ndarray, step: float) -> str:
-    """Returns what the signal did before it stopped: "noise" larger than its step, "movement" in one
-    direction that does not slow down, "" for neither (it rests, or comes to rest), "edge" if the record has
-    too few samples there."""
+    """Returns what the signal did before it stopped. "noise": changes larger than its step; "movement": in
+    one direction without slowing down; "": neither (it rests, or comes to rest); "edge": the record has too
+    few samples there."""
     changes = changes[np.isfinite(changes)]
     if len(changes) < BESIDE // 2:
         return "edge"

@@ -1,5 +1,6 @@
-"""Finds, in the figures of the stages, the figures of each controller of the temperature loop that its rules
-need: as deployed, over all plants, at the 90 % quantile with the band of that quantile."""
+"""Finds the figures of each controller of the temperature loop that its rules need, in the figures of the
+stages. They are for the controller as deployed, over all plants, at the 90 % quantile with the band of that
+quantile."""
 
 import math
 from collections.abc import Mapping, Sequence
