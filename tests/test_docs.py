@@ -387,7 +387,7 @@ def test_the_reference_has_every_stage_command_and_word(root, generated):
     assert all(f"## {name}\n" in commands for name in cli.COMMANDS)
     assert "| `--rate` | snapshots a second | `5.0` |" in commands
     assert "| 75 | another nightly run is at work | wait for it |" in generated.exit_codes()
-    assert "Disk margin\n  Change of gain and phase" in generated.glossary()
+    assert "Disk margin\n  How much gain and phase may change" in generated.glossary()
 
 
 @pytest.mark.parametrize("loop", LOOPS)

@@ -1,6 +1,5 @@
-"""Clocks that do not run forward: what can be put right without a guess is, and is counted; `check_clock`
-refuses the rest.
-"""
+"""Repairs clocks that do not run forward if no guess is needed, and counts the repairs; `check_clock` refuses
+the rest."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -11,29 +10,30 @@ import numpy as np
 from pipeline.recordings.formats import FileColumns, Note
 
 HOUR_S = 3600
-# a clock that runs on for no more than so many samples before it falls back is not one clock
+# if a clock falls back after every few samples (this many on average, or fewer), it is not a single clock
 OTHER_DEVICE_RUN = 8
-# rows that came late, or had a time that another one has: more than that is another device, or no clock
+# most rows that came late or repeat a time: if there are more, they are from another device, or it is no
+# clock
 FEW_SHARE, FEW_ROWS_OF = 0.02, 10
-# a row that came late is no more than so many behind
+# a late row is at most this many rows behind
 LATEST_ROWS = 8
-# stretches between restarts that begin and end within so many intervals are of one clock
+# stretches between restarts are of one clock if they begin and end within this many intervals
 AGREE_INTERVALS = 3
-# seconds that hold as many rows each, but one; and rows that take turns between two courses
+# fewest stamps, share of seconds with equally many rows (one more or less), share of rows that alternate
 LEAST_STAMPS, ALIKE_SHARE, TURNS_SHARE = 4, 0.9, 0.8
 
 
-# columns whose time runs forward, the indices of the rows at which the clock had started over, and notes
+# columns with time running forward, the indices of the rows at which the clock had started over, and notes
 Repaired = tuple[FileColumns, np.ndarray, list[Note]]
 
 
 def repair(path: Path, group: FileColumns, *, may_restart: bool) -> Repaired:
-    """The columns on a clock that runs forward.
+    """Returns the columns on a clock that runs forward, the rows at which it had started over, and notes.
 
-    An hour that the end of summer time repeats on a clock without zone is counted on. One that starts over
-    goes on behind what was before, and its first row is a restart. Stamps of whole seconds with several rows
-    each are spread evenly. A few late rows are sorted back. Of rows with one time the first stays: exact
-    repeats are dropped, and a few others.
+    The hour that the end of summer time repeats on a clock without zone is counted on. A clock that starts
+    over continues after the last time before, and its first row is a restart. Stamps of whole seconds with
+    several rows each are spread evenly. A few late rows are sorted back. Keeps the first row of each
+    timestamp and drops the others: exact repeats, and at most a few that differ.
 
     Raises ValueError with the place if that is not enough.
     """
@@ -51,10 +51,11 @@ def repair(path: Path, group: FileColumns, *, may_restart: bool) -> Repaired:
 
 
 def repair_topics(path: Path, groups: Sequence[FileColumns], *, one_clock: bool) -> list[Repaired]:
-    """`repair` for the groups of a recording, which start over together.
+    """Returns the results of `repair` for the groups of a recording, which start over together.
 
-    Each must have started over as often. Where they have not `one_clock`, the recorder's, the stretches
-    between must also agree in start and end, as a clock that one device alone set back would not.
+    Every group must have started over equally often. If they do not share `one_clock`, the recorder's, the
+    stretches between restarts must also agree in start and end. They would not if only one device had set
+    back its clock.
     """
     if len(groups) == 1:
         return [repair(path, groups[0], may_restart=True)]
@@ -75,7 +76,7 @@ def repair_topics(path: Path, groups: Sequence[FileColumns], *, one_clock: bool)
 
 
 def _forward(path: Path, group: FileColumns, restarts: np.ndarray, notes: list[Note]) -> Repaired:
-    """Stamps that share a second spread, late rows sorted back, repeats dropped; checked."""
+    """Spreads stamps that share a second, sorts late rows back, drops repeats, and checks the clock."""
     group = group._replace(time=_distribute_stamps(group, restarts, notes))
     order = _forward_rows(group, notes)
     columns = _rows(group, order)
@@ -94,7 +95,7 @@ def _note(kind: str, rows: np.ndarray, place: Callable[[int], str], message: str
 
 
 def _interval(time: np.ndarray) -> float:
-    """The median of the intervals that run forward."""
+    """Returns the median of the intervals that run forward."""
     steps = np.diff(time)
     return float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
 
@@ -104,7 +105,7 @@ def _few(rows: int, total: int) -> bool:
 
 
 def _summer_time(group: FileColumns, notes: list[Note]) -> np.ndarray:
-    """The times with an hour added behind each fall by an hour, on a calendar without zone."""
+    """Returns the times, with an hour added after each fall by an hour, if the calendar has no zone."""
     time = group.time
     if time.dtype != np.int64 or group.zone:
         return time
@@ -120,14 +121,14 @@ def _summer_time(group: FileColumns, notes: list[Note]) -> np.ndarray:
 
 
 def _restarts(time: np.ndarray) -> np.ndarray:
-    """The indices of the rows at which a clock starts over."""
+    """Returns the indices of the rows at which a clock starts over."""
     starts, restarts = _falls(time), []
     if not len(starts) or not np.isfinite(time).all():
         return np.empty(0, int)
     ends, first, latest = np.r_[starts[1:], len(time)], time[0], time[starts[0] - 1]
     for start, end in zip(starts, ends, strict=True):
         run = time[start:end]
-        # late rows are a few, and soon followed by the one that was due
+        # late rows are few, and the row that was due soon follows
         if run[0] <= first or np.searchsorted(run, latest) > LATEST_ROWS:
             restarts.append(int(start))
             first, latest = run[0], run[-1]
@@ -147,8 +148,8 @@ def _restart_note(group: FileColumns, rows: np.ndarray) -> Note:
 
 
 def _going_on(times: Sequence[np.ndarray], restarts: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The times of each group, in which a stretch begins one interval behind the one before; all groups by
-    the same."""
+    """Returns the times of each group. Each stretch begins one interval after the end of the previous one.
+    All groups are shifted equally."""
     shifted = [time.copy() for time in times]
     interval = np.asarray(max(_interval(time) for time in times)).astype(times[0].dtype)
     views = [np.split(time, rows) for time, rows in zip(shifted, restarts, strict=True)]
@@ -160,7 +161,7 @@ def _going_on(times: Sequence[np.ndarray], restarts: Sequence[np.ndarray]) -> li
 
 
 def _agree(groups: Sequence[FileColumns], restarts: Sequence[np.ndarray]) -> bool:
-    """Whether the stretches of all groups begin and end within a few intervals of each other."""
+    """Returns whether the stretches of all groups begin and end within a few intervals of each other."""
     tolerance = AGREE_INTERVALS * max(_interval(group.time) for group in groups)
     ends = np.array(
         [
@@ -172,10 +173,10 @@ def _agree(groups: Sequence[FileColumns], restarts: Sequence[np.ndarray]) -> boo
 
 
 def _distribute_stamps(group: FileColumns, restarts: np.ndarray, notes: list[Note]) -> np.ndarray:
-    """Times of rows that share a stamp of whole seconds, spread evenly over it.
+    """Returns the times, with rows that share a stamp of whole seconds spread evenly over it.
 
-    Nearly every second must hold as many rows, and the rows must not be exact repeats nor take turns between
-    two courses, as those of two devices do.
+    This is done only if nearly every second has equally many rows. The rows must not be exact repeats or
+    alternate between two courses, as those of two devices do.
     """
     time = group.time
     begins = np.r_[True, np.diff(time) != 0]
@@ -203,7 +204,7 @@ def _distribute_stamps(group: FileColumns, restarts: np.ndarray, notes: list[Not
 
 
 def _repeats(group: FileColumns) -> np.ndarray:
-    """Mask (n - 1,) of the rows that are the row before once more."""
+    """Returns a mask (n - 1,) of the rows that repeat the previous row."""
     repeats = group.time[1:] == group.time[:-1]
     for column in group.values.values():
         repeats &= (column[1:] == column[:-1]) | (np.isnan(column[1:]) & np.isnan(column[:-1]))
@@ -211,7 +212,7 @@ def _repeats(group: FileColumns) -> np.ndarray:
 
 
 def _take_turns(group: FileColumns, place: np.ndarray, rows: int) -> bool:
-    """Whether some column goes up at one place of each stamp and down at another."""
+    """Returns whether some column goes up at one place of each stamp and down at another."""
     for column in group.values.values():
         change = np.diff(column)
         shares = [
@@ -225,8 +226,8 @@ def _take_turns(group: FileColumns, place: np.ndarray, rows: int) -> bool:
 
 
 def _forward_rows(group: FileColumns, notes: list[Note]) -> np.ndarray:
-    """Indices of the rows in the order of time, without those whose time another one has. All rows where too
-    many would move or be left out."""
+    """Returns the indices of the rows in the order of time, one for each time. Returns all rows if too many
+    would have to be moved or dropped."""
     time = group.time
     order = rows = np.arange(len(time))
     lateness = np.maximum.accumulate(time) - time
@@ -258,7 +259,7 @@ def _forward_rows(group: FileColumns, notes: list[Note]) -> np.ndarray:
 
 
 def check_clock(path: Path, group: FileColumns) -> None:
-    """Raises ValueError with the place if a time is missing, repeated or before the one ahead of it."""
+    """Raises ValueError with the place if a time is missing, repeated or earlier than the previous one."""
     time = group.time
     missing = np.flatnonzero(~np.isfinite(time))
     if len(missing):
@@ -286,7 +287,7 @@ def check_clock(path: Path, group: FileColumns) -> None:
 
 
 def _remedy(group: FileColumns, steps_s: np.ndarray, back: np.ndarray) -> str:
-    """The remedy for a clock that stands still or runs backwards, by the way it does."""
+    """Returns the remedy for a clock that stands still or runs backwards, by the way it does so."""
     step = steps_s[back[0]]
     remedies = (
         (step == 0, "name a finer clock, or give each device or tag that writes here a column of its own"),

@@ -1,9 +1,10 @@
-"""Recordings that stay where they lie though no stage reads them: excluded.yaml in their loop's folder.
+"""Lists recordings that stay in their folder but that no stage reads: excluded.yaml in their loop's folder.
 
-What git or DVC keeps must not be moved: a clone has it again, and a commit would delete it for everybody. So
-a night that sets it aside lists it. The list lies among the recordings: the stages depend on it as on them,
-and it is committed with them, so every clone leaves out the same. An entry counts while the recording has the
-content that was refused: a recording that was mended is read again.
+Files that git or DVC keeps must not be moved: a clone has them again, and a commit would delete them for
+everybody. A nightly run that excludes a recording therefore lists it. The list is in the folder of the
+recordings. The stages depend on it as on them, and it is committed with them, so every clone leaves out the
+same files. An entry counts only while the recording has the content that was refused. A recording that was
+repaired is read again.
 """
 
 from collections.abc import Iterable
@@ -26,7 +27,7 @@ Exclusion = dict[str, str]
 
 
 def read_list(folder: str | Path) -> dict[str, Exclusion]:
-    """{path below the folder: exclusion}; empty where there is no list. Raises ValueError if the list
+    """Returns {path below the folder: exclusion}; empty if there is no list. Raises ValueError if the list
     cannot be read."""
     path = Path(folder) / FILE
     try:
@@ -36,7 +37,7 @@ def read_list(folder: str | Path) -> dict[str, Exclusion]:
 
 
 def parse(text: str) -> dict[str, Exclusion]:
-    """The entries of a list. Raises ValueError if the text is none."""
+    """Returns the entries of a list. Raises ValueError if the text is not such a list."""
     try:
         entries = yaml.safe_load(text) or {}
         return {str(name): {key: str(e[key]) for key in ("sha256", "reason")} for name, e in entries.items()}
@@ -56,13 +57,14 @@ def write(folder: str | Path, entries: dict[str, Exclusion]) -> None:
 
 
 def exclude(path: str | Path, folder: str | Path, reason: str) -> None:
-    """Lists a recording below `folder`, a file or the folder of a bag, as it is now."""
+    """Adds a recording below `folder`, a file or the folder of a bag, with its present content to the
+    list."""
     name = Path(path).relative_to(folder).as_posix()
     write(folder, read_list(folder) | {name: {"sha256": artifacts.sha256(path), "reason": reason}})
 
 
 def exclusions(folder: str | Path) -> frozenset[Path]:
-    """The recordings below `folder` that are listed, and still what they were when they were refused."""
+    """Returns the recordings below `folder` that are listed and still have the content that was refused."""
     folder = Path(folder)
     return frozenset(
         folder / name
@@ -72,6 +74,6 @@ def exclusions(folder: str | Path) -> frozenset[Path]:
 
 
 def readable(paths: Iterable[Path], folder: str | Path) -> list[Path]:
-    """Those of `paths`, files or bags below `folder`, that are not excluded, in their order."""
+    """Returns those of `paths`, files or bags below `folder`, that are not excluded, in their order."""
     left_out = exclusions(folder)
     return [path for path in paths if path not in left_out and not left_out.intersection(path.parents)]

@@ -1,6 +1,5 @@
-"""Recognises the format of a recording. Holds what all formats share: the records that are passed from a file
-to the learners, columns on a clock, the choice of the time column, and tables small enough to be read
-whole."""
+"""Recognises the format of a recording. Holds what all formats share: records passed from a file to the
+learners, columns on a clock, the choice of the time column, and tables small enough to be read whole."""
 
 import collections
 import difflib
@@ -157,8 +156,8 @@ def _is_workbook(path: Path) -> bool:
         return path.suffix.casefold() in (".xlsx", ".xlsm")
 
 
-# a number beyond the first of each row is no time in seconds but an epoch in ms, us, ns, or 100 ns as Windows
-# counts from 1601 (1e11 s is the year 5138)
+# a number above the first one of a row is not in seconds. It is an epoch in ms, us, ns, or in 100 ns since
+# 1601 as in Windows (1e11 s would be the year 5138)
 _EPOCHS = (
     (5e17, 1e9, 0, "ns"),
     (1e17, 1e7, 11_644_473_600, "100 ns since 1601"),
@@ -169,8 +168,8 @@ _EPOCHS = (
 _TICKS, _SINCE_YEAR_1_S = (6.2e17, 6.7e17), 62_135_596_800
 # seconds since 1904, as LabVIEW counts, from 2015 to 2040
 _SINCE_1904_S, _LABVIEW = 2_082_844_800, (3.5e9, 4.3e9)
-# days since 1899-12-30 (since 1904 where the column says so) and since the year 0, from 1954 to 2119, and
-# 1970-01-01 in them
+# days since 1899-12-30 (since 1904 if the column says so) and since the year 0: their values from 1954 to
+# 2119, and that of 1970-01-01
 _SERIAL_DAYS = ((20_000, 80_000, 25_569, "spreadsheets"), (713_000, 774_000, 719_529, "MATLAB"))
 # fractions of a day, and Julian dates from 1858 to 2132
 _DAYS = ((0, 2), (2_400_000, 2_500_000))
@@ -212,7 +211,7 @@ _TIME_NAMES = (
 DATE_NAMES = ("date", "datum", "fecha", "data")
 # names of dates and times in languages that write the day before the month
 _DAY_FIRST = ("datum", "fecha", "data", "heure", "hora", "ora", "uhrzeit", "zeit", "zeitstempel")
-# times from a start, which no date beside them belongs to
+# times from a start; a date column beside them does not belong to them
 _ELAPSED = ("elapsed", "elapsed_time", "relative_time", "uptime", "runtime")
 # what pandas calls the index of a table where nobody named it
 INDEX_NAMES = ("", "Unnamed: 0", "__index_level_0__", "index")
@@ -226,7 +225,7 @@ _PER_SECOND = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0,
 _COUNTS = {"millis": "ms", "milliseconds": "ms", "micros": "us", "microseconds": "us", "nanoseconds": "ns"}
 
 _PARQUET = b"PAR1"
-# the format that a name promises, and how a format is called
+# the format that a suffix stands for, and the names of formats
 SUFFIXES = {".csv": "csv", ".parquet": "parquet", ".xlsx": "xlsx", ".mat": "MATLAB"}
 NAMES = {"csv": "CSV", "parquet": "Parquet", "mcap": "MCAP"}
 # text has tabs, line ends and form feeds, and sometimes the end mark of an old system; other control
@@ -521,12 +520,12 @@ def every(time: str) -> float | None:
     return interval if 0 < interval < np.inf else None
 
 
-# a clock that begins later than three years is one of the calendar; it is counted from the record's first
-# whole second, so that floats hold nanoseconds
+# a clock that begins after more than three years is a calendar's. It is counted from the record's first whole
+# second, so floats hold nanoseconds
 CALENDAR_S = 1e8
 
 
-# what is unpacked of one spreadsheet or MATLAB file, in bytes; a print log of a day has 100 MB
+# most bytes unpacked from one spreadsheet or MATLAB file; a print log of a day has 100 MB
 LARGEST_UNPACKED = 1 << 29
 MOST_COLUMNS = 2000
 # numbers of one table: 0.8 GB
@@ -594,7 +593,7 @@ def _clock(
     """Returns (time, zone) from the column that `time` names, or from the first column with the name of a
     time."""
     if not time and table.stamps:
-        # beside dates a temperature or a counter is no time
+        # if there are dates, a temperature or a counter is not the time
         called = [
             name
             for name in (*table.stamps, *table.values)

@@ -57,14 +57,14 @@ _ROS = {
     "foxglove_msgs/RawImage": "sec:I nsec:I frame_id:s width:I height:I encoding:s step:I data:b",
     "foxglove_msgs/CompressedImage": "sec:I nsec:I frame_id:s data:b format:s",
 }
-# a picture of that many is 256 MB of 16 bits; the largest of cameras have some 1.5e8
+# a 16-bit picture of this many pixels has 256 MB; the largest cameras have about 1.5e8
 MOST_PIXELS = 1 << 27
 _FOXGLOVE = ("foxglove/RawImage", "foxglove/CompressedImage")
 READABLE = (
     "sensor_msgs Image and CompressedImage (ROS 2, ROS 1), "
     "foxglove RawImage and CompressedImage (protobuf, JSON, ROS)"
 )
-# CDR representation -> byte order; no field is longer than four bytes, so that both alignments agree
+# CDR representation -> byte order; no field is longer than four bytes, so both alignments agree
 _ORDERS = {b"\x00\x00": ">", b"\x00\x01": "<", b"\x00\x06": ">", b"\x00\x07": "<"}
 
 _MONO = {"mono8", "8uc1"}
@@ -76,7 +76,7 @@ _COLOUR = {
     "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2GRAY), "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2GRAY),
     "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2GRAY), "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2GRAY),
 }  # fmt: skip
-# of two bytes a pixel, the one with the luma
+# which of a pixel's two bytes holds the luma
 _LUMA = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
 ENCODINGS = (
     "mono8, mono16, rgb8, bgr8, rgba8, bgra8, 8UC1, 8UC3, 8UC4, 16UC1, bayer_*8, yuv422 and yuv422_yuy2"
@@ -85,14 +85,14 @@ ENCODINGS = (
 
 FRAME_ID = "nozzle"
 IMAGE_TOPIC = "/nozzle/image"
-# encoding -> ending and settings of cv2.imencode. A camera's frame is noise to a compressor: with one filter
-# and runs only, a PNG of level 1 is smaller than with a filter chosen for each row, is written in half the
-# time and read in two thirds of it
+# encoding -> ending and settings of cv2.imencode. A camera's frame is noise to a compressor. With one filter
+# and run lengths only, a PNG of level 1 is smaller than with a filter chosen for each row; it is written in
+# half the time and read in two thirds of the time
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
         cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP]  # fmt: skip
 ENCODERS = {"jpeg": (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 95]), "png": (".png", _PNG), "raw": ("", [])}
 MISSING, UNREADABLE = "the image is missing", "the image cannot be read"
-# the error stream is the process's: threads of a cluster's worker take turns
+# the error stream belongs to the whole process, so threads of a cluster's worker take turns
 _LISTENING = threading.Lock()
 
 
@@ -240,7 +240,7 @@ def gray(picture: ImageMessage) -> np.ndarray:
     if encoding in _MONO:
         return _rows(picture, 1)
     if encoding in _MONO_16:
-        # a copy in any case: the bytes in a message need not be aligned
+        # always a copy, because the bytes in a message may be unaligned
         return _rows(picture, 2).view(">u2" if picture.big_endian else "<u2").astype(np.uint16)
     if encoding in _LUMA:
         return np.ascontiguousarray(_rows(picture, 2)[:, _LUMA[encoding] :: 2])
@@ -284,7 +284,7 @@ def _decode_picture(data: bytes | memoryview, flags: int) -> np.ndarray | None:
     its header declares more than MOST_PIXELS."""
     height, width = _size(bytes(data[: 1 << 16]))
     if height * width > MOST_PIXELS:
-        # they would take the memory before the first of them is read
+        # they would take the memory before the first pixel is read
         raise UnreadableMessage(
             f"its header says {width} x {height} px; pictures of up to {MOST_PIXELS} px are read"
         )
@@ -331,7 +331,7 @@ def decode(data: bytes) -> np.ndarray:
     which says what the bytes hold instead."""
     if not data:
         raise ValueError("an empty file")
-    # a broken end is filled with gray: the end mark must follow the last scan
+    # the decoder fills a broken end with gray, so the end mark must follow the last scan
     if data.startswith(b"\xff\xd8") and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
         raise ValueError(f"a JPEG of {len(data)} bytes without its end")
     frame = _decode_picture(data, cv2.IMREAD_IGNORE_ORIENTATION)
@@ -404,7 +404,7 @@ class Frames:
                     times[number] += getattr(messages, self._time)
                     continue
                 for message in messages.data:
-                    # one that cannot be read is met again, and counted, where frames are decoded
+                    # a message that cannot be read is counted later, when frames are decoded
                     with contextlib.suppress(UnreadableMessage):
                         times[number].append(readers[number](message).stamp_ns)
         numbers = sorted((number for number in times if times[number]), key=lambda number: times[number][0])

@@ -1,6 +1,7 @@
-"""A recording described in words, and a mapping to paste into params.yaml.
+"""Describes a recording in words, and proposes a mapping to paste into params.yaml.
 
-The words give its format, its clocks with rate, jitter and gaps, its signals with their ranges, and damage.
+The description gives its format, its clocks with rate, jitter and gaps, its signals with their ranges, and
+damage.
 """
 
 import collections
@@ -41,7 +42,7 @@ from pipeline.recordings.proposals import (
 from pipeline.recordings.quality import quantisation_step
 from pipeline.recordings.resampling import GAP_INTERVALS, intervals
 
-# numbers of a topic, and columns of a table, that are described; the others are counted
+# most numbers of a topic, and most columns of a table, that are described; the others are only counted
 MOST_FIELDS, MOST_SIGNALS = 64, 128
 CODE = "missing code"  # kind of the note on numbers that stand for a missing value
 _NO_TIME = (
@@ -55,8 +56,8 @@ _Read = Callable[[Sequence[str], str], tuple[FileColumns, list[Note]]]
 
 
 class Inspected(NamedTuple):
-    """A recording as it was looked at: its format, words on its content, columns with the prefix of their
-    sources, their signals, and notes; `time` is what ingest.time must be, "" for what is found."""
+    """A recording after one look: its format, words on its content, columns with the prefix of their sources,
+    their signals, and notes. `time`: what ingest.time must be, "" if the clock was found."""
 
     kind: str
     lines: list[str]
@@ -67,7 +68,7 @@ class Inspected(NamedTuple):
 
 
 def inspect(path: str | Path) -> str:
-    """The recording in words, and at the end YAML to paste under `ingest.mapping` and `plant`.
+    """Returns the recording in words, and at the end YAML to paste under `ingest` and `plant`.
 
     Raises ValueError if nothing can be read.
     """
@@ -90,7 +91,7 @@ def inspect(path: str | Path) -> str:
 
 
 def look(path: Path) -> Inspected:
-    """The recording read once, for its description and for a proposal. Raises ValueError if nothing can be
+    """Reads the recording once, for its description and for a proposal. Raises ValueError if nothing can be
     read."""
     kind = file_format(path)
     limits: dict[str, tuple[float, float]] = {}
@@ -130,7 +131,8 @@ def look(path: Path) -> Inspected:
 
 
 def _table(path: Path, columns: Sequence[FileColumn], has_clock: bool, read: _Read) -> _Content:
-    """Words, columns, units and notes of a table, which `read` reads; `has_clock`: a clock of its own."""
+    """Returns words, columns, units and notes of a table that `read` reads. `has_clock`: it has a clock of
+    its own."""
     names = [column.name for column in columns]
     numeric = [column.name for column in columns if column.type == "number" and column.name]
     numbers = set(numeric)
@@ -180,7 +182,7 @@ def _table(path: Path, columns: Sequence[FileColumn], has_clock: bool, read: _Re
     if untimed:
         notes.append(Note("clock", "", 1, _NO_TIME))
     notes += _unit_note(clock, group)
-    # a second time beside the clock is no signal
+    # a second time column is no signal
     values = {
         name: column
         for name, column in group.values.items()
@@ -190,8 +192,8 @@ def _table(path: Path, columns: Sequence[FileColumn], has_clock: bool, read: _Re
 
 
 def _unit_note(clock: str, group: FileColumns) -> list[Note]:
-    """A note on a clock that would have minutes between its samples, as one in ms has without its unit, or
-    more of them a second than a log of temperatures holds, as one in hours has."""
+    """Returns a note on a clock that is probably not in seconds. Its samples would be minutes apart, as for
+    ms without their unit; or they would be too many per second for a log of temperatures, as for hours."""
     time = group.time[:CLOCK_SAMPLES]
     if not clock or time.dtype == np.int64 or len(time) < 3:
         return []
@@ -210,7 +212,7 @@ def _unit_note(clock: str, group: FileColumns) -> list[Note]:
 
 
 def _mcap(path: Path) -> _Content:
-    """Words, columns, units and notes of an MCAP file or a bag, in one walk."""
+    """Returns words, columns, units and notes of an MCAP file or a bag, reading each part once."""
     surveys = [survey(part, MOST_FIELDS) for part in (bag_parts(path) if path.is_dir() else [path])]
     by_name = merged([part.topics for part in surveys])
     lines, groups, units = [f"{len(by_name)} topics"], [], {}
@@ -233,7 +235,7 @@ def _mcap(path: Path) -> _Content:
 
 
 def _content(topic: Topic) -> str:
-    """Count, encodings and numbers of a topic, or why it cannot be read."""
+    """Returns count, encodings and numbers of a topic, or why it cannot be read."""
     schemas = {f"{channel.encoding}, {channel.schema_name or 'no schema'}" for channel in topic.channels}
     content = f"{len(topic.fields)} numbers" if topic.fields else "no numbers"
     if topic.unreadable:
@@ -274,7 +276,7 @@ def _clock(path: Path, group: FileColumns) -> list[str]:
 
 
 def finite(values: np.ndarray) -> np.ndarray:
-    """The values that are finite; no copy where all are."""
+    """Returns the values that are finite; they are not copied if all are."""
     if len(values) and np.isfinite(values.min()) and np.isfinite(values.max()):
         return values
     return values[np.isfinite(values)]

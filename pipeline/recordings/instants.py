@@ -1,5 +1,5 @@
-"""Times written as text -> nanoseconds on one calendar: ISO 8601, the dates of other countries, times of
-day."""
+"""Converts times written as text to nanoseconds on one calendar: ISO 8601, the dates of other countries,
+times of day."""
 
 import calendar
 import contextlib
@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-# a clock is steady where no step is longer than so many medians, and there are so many; steps within a date
-# are the same in either order, and so many of them do
+# a clock is steady if it has at least FEWEST_STEPS and none is longer than STEADY medians. Steps within a
+# date are the same in either order, so FIRST_STEPS of them are enough
 STEADY, FEWEST_STEPS, FIRST_STEPS = 1.5, 5, 1000
 DAY_NS = 86_400 * 10**9
 _EPOCH = datetime.date(1970, 1, 1).toordinal()
@@ -34,9 +34,9 @@ _TEXT = re.compile(
 _PARTS = ("date", "hours", "minutes", "seconds", "fraction", "half", "zone")
 # 20251121130000 and 20251121130000250, as controllers stamp
 _COMPACT = re.compile(r"\s*((?:19|20)\d\d(?:0[1-9]|1[0-2])[0-3]\d)([0-2]\d)([0-5]\d)([0-5]\d)(\d{3})?\s*$")
-# what stands behind the seconds and a hyphen: a fraction as the camera program of CAXTON writes it, or a zone
+# the digits after the seconds and a hyphen: a fraction as in CAXTON's camera program, or a zone
 _HYPHEN = re.compile(r"(:\d\d)-(\d{1,6})\s*$")
-# zones by the letters that programs write behind a time; each says whether it is summer
+# zones by the letters that programs write after a time; each says whether it is summer
 _ZONE_HOURS = {
     "UTC": 0, "GMT": 0, "WET": 0, "WEST": 1, "BST": 1, "CET": 1, "CEST": 2, "MEZ": 1, "MESZ": 2,
     "EET": 2, "EEST": 3, "MSK": 3, "JST": 9, "KST": 9, "AEST": 10, "AEDT": 11,
@@ -46,7 +46,7 @@ EXPECTED = "seconds or ISO 8601 such as 2025-11-21T13:00:00.5"
 
 
 class Instants(NamedTuple):
-    """ns (n,) since 1970, or since midnight for text without a date. `zoned`: every time names its zone."""
+    """ns (n,) since 1970, or since midnight if the text has no date. `zoned`: every time names its zone."""
 
     ns: np.ndarray
     zoned: bool
@@ -54,12 +54,12 @@ class Instants(NamedTuple):
 
 
 def is_compact(text: str) -> bool:
-    """Whether a number is a date and a time without marks between, 20251121130000."""
+    """Returns whether a number is a date and a time without separators, 20251121130000."""
     return bool(_COMPACT.match(text))
 
 
 def is_date(text: str) -> bool:
-    """Whether a text begins with a date."""
+    """Returns whether a text begins with a date."""
     return bool(re.match(rf"\s*{_DATE}", text))
 
 
@@ -72,11 +72,12 @@ def instants(
     month_first: bool | None,
     hyphen_fraction: bool = False,
 ) -> Instants:
-    """The instants that `fields` name. `month_first` decides 05/03/2025; None refuses it. `hyphen_fraction`
-    decides 13:12:54-05: five hundredths of a second, else five hours west.
+    """Returns the instants that `fields` name. `month_first` decides 05/03/2025; None refuses it.
+    `hyphen_fraction` decides 13:12:54-05: five hundredths of a second, or else five hours west.
 
-    The hour that the end of summer time in Europe/Berlin repeats is its second one behind the instant of the
-    field before. Raises ValueError with the line of a field that is no time.
+    In a zone such as Europe/Berlin the end of summer time repeats an hour. Its second one is used if the
+    first would not be later than the previous field. Raises ValueError with the line if a field is not a
+    time.
     """
     ns = np.empty(len(fields), np.int64)
     zoned, dated, previous = True, False, None
@@ -96,7 +97,7 @@ def instants(
 
 
 def _instant(field: str, month_first: bool | None, previous: int | None) -> tuple[int, bool, bool]:
-    """(ns, has a zone, has a date) of one text. Raises ValueError for text that is no time."""
+    """Returns (ns, has a zone, has a date) of one text. Raises ValueError if the text is not a time."""
     compact = _COMPACT.match(field)
     if compact:
         date, hours, minutes, seconds, fraction = compact.groups()
@@ -119,7 +120,7 @@ def _instant(field: str, month_first: bool | None, previous: int | None) -> tupl
 
 
 def _iso(field: str) -> tuple[int, bool, bool]:
-    """The rarer forms of ISO 8601, such as 20251121T130000Z."""
+    """Returns the same for the rarer forms of ISO 8601, such as 20251121T130000Z."""
     instant = datetime.datetime.fromisoformat(field.strip())
     zone = instant.utcoffset()
     since = instant.replace(tzinfo=None) - datetime.datetime(1970, 1, 1) - (zone or datetime.timedelta())
@@ -128,7 +129,7 @@ def _iso(field: str) -> tuple[int, bool, bool]:
 
 @functools.lru_cache(maxsize=4096)
 def _day(date: str, month_first: bool | None) -> int:
-    """Days since 1970 of one date; recordings have few of them."""
+    """Returns the days since 1970 of one date; recordings have few different dates."""
     parts = [date[:4], date[4:6], date[6:]] if date.isdigit() else re.split(r"[-/.]", date)
     if len(parts[0]) == 4:
         year, month, day = map(int, parts)
@@ -145,9 +146,9 @@ def _day(date: str, month_first: bool | None) -> int:
 
 
 def month_first(dates: Iterable[str], sample: str) -> bool | None:
-    """Whether dates such as 05/03/2025 begin with the month, None if nothing tells.
+    """Returns whether dates such as 05/03/2025 begin with the month, None if nothing decides it.
 
-    A date that can be only one of both tells, and so do the am and pm of `sample` where the days run on in
+    A date that can be read only one way decides. So do the am and pm of `sample` if the days continue within
     one month: 11/03 before 12/03 is the next day in Australia, and a month later in America. A single day is
     the same either way.
     """
@@ -163,10 +164,10 @@ def month_first(dates: Iterable[str], sample: str) -> bool | None:
 
 
 def steady_order(stamps: Iterable[str]) -> bool | None:
-    """Whether the month stands first in dates that can be both, by the one reading that runs forward in
-    steps that are nearly equal; None if neither does or both do.
+    """Returns whether the month comes first in dates that can be read both ways. The order is used if only
+    its reading runs forward in nearly equal steps; None if neither does or both do.
 
-    Steps count where the date changes, and at the first stamps. Text that is no time is passed over.
+    Only the first steps and those at which the date changes are used. Text that is not a time is skipped.
     """
     steps: dict[bool, list[int]] = {False: [], True: []}
     for earlier, later in itertools.pairwise(stamps):
@@ -187,23 +188,24 @@ def steady_order(stamps: Iterable[str]) -> bool | None:
 
 
 def hyphen_fraction(fields: Iterable[str]) -> bool:
-    """Whether the digits behind hyphens, as in 14:12:33-797, are fractions of a second.
+    """Returns whether the digits after hyphens, as in 14:12:33-797, are fractions of a second.
 
-    One field that can be no zone tells for all: zones are written as -HH or -HHMM, up to 14 hours. Fields
-    are looked at up to it, or up to one without such digits.
+    One field that cannot be a zone decides for all, because zones are written as -HH or -HHMM, up to 14
+    hours. Fields are checked up to this one, or up to one without such digits.
     """
     matches = itertools.takewhile(bool, map(_HYPHEN.search, fields))
     return any(not _is_offset(match[2]) for match in matches if match)
 
 
 def _is_offset(digits: str) -> bool:
-    """Whether a zone may lie HH or HHMM away from UTC."""
+    """Returns whether a zone may be HH or HHMM away from UTC."""
     hours, minutes = int(digits[:2]), int(digits[2:] or 0)
     return len(digits) in (2, 4) and minutes < 60 and hours * 60 + minutes <= 14 * 60
 
 
 def _offset_ns(zone: str, local_ns: int, previous: int | None) -> int:
-    """What a clock of that zone is ahead of UTC at its time `local_ns`. Raises ValueError for no zone."""
+    """Returns by how much a clock of that zone is ahead of UTC at its time `local_ns`. Raises ValueError if
+    it is not a zone."""
     if zone in ("", "Z", "z"):
         return 0
     if zone in _ZONE_HOURS:
@@ -220,7 +222,8 @@ def _offset_ns(zone: str, local_ns: int, previous: int | None) -> int:
 
 @functools.lru_cache(maxsize=4096)
 def _region_offsets_ns(zone: str, quarter: int) -> tuple[int, int]:
-    """Offsets of a zone such as Europe/Berlin in a quarter of an hour of its own clock since 1970.
+    """Returns the two offsets of a zone such as Europe/Berlin in a quarter of an hour of its own clock since
+    1970.
 
     They differ in an hour that is repeated or left out.
     """
@@ -234,7 +237,7 @@ def _region_offsets_ns(zone: str, quarter: int) -> tuple[int, int]:
 
 
 def over_midnight(ns: np.ndarray) -> tuple[np.ndarray, int]:
-    """Times of day that run on over midnight, and the count of midnights. A day is added after each fall by
-    more than half a day."""
+    """Returns times of day that continue over midnight, and the number of midnights. A day is added after
+    each fall by more than half a day."""
     midnights = np.cumsum(np.r_[0, np.diff(ns) < -DAY_NS // 2])
     return ns + midnights * DAY_NS, int(midnights[-1])

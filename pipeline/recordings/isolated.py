@@ -1,8 +1,8 @@
-"""Work on a stranger's file, done in a warm child process within a budget of time and memory.
+"""Reads an unknown file in a warm child process, within a budget of time and memory.
 
-A child serves one call after the other, each in the folder of its caller. A call that runs out of its budget,
-or that ends the process, costs that call alone: the next one gets a fresh child. Calls go to the child
-pickled, as they are ours. Results come back as JSON, so that nothing a file did to the child runs here.
+A child serves one call after the other, each in the folder of its caller. A call that exceeds its budget, or
+ends the process, fails alone, because the next one gets a fresh child. Calls are sent to the child pickled,
+because they are our own. Results come back as JSON, so that nothing a file did to the child runs here.
 """
 
 import contextlib
@@ -23,23 +23,24 @@ if sys.platform != "win32":
 
 ROOT = Path(__file__).parents[2]
 _LENGTH = struct.Struct("<Q")
-# a child that keeps so much behind a call is replaced: the next call has its whole budget
+# a child that still holds this much after a call is replaced, so the next call has its whole budget
 KEPT_MB = 256
-# what C++, Python and Arrow print last where memory is refused them; Arrow then ends the process
+# the last words of C++, Python and Arrow if they get no memory; Arrow then ends the process
 OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "Out of memory", "memory allocation of")
 # the child's own code; -P: a folder `pipeline` in the working directory is not ours
 _SERVE = "from pipeline.recordings.isolated import serve; serve()"
 
 
 class Budget(NamedTuple):
-    """What one file may cost: seconds of the clock, and megabytes beyond what the child needs by itself."""
+    """The limits for one file: seconds of wall-clock time, and megabytes beyond what the child itself
+    needs."""
 
     longest_s: float
     largest_mb: float
 
 
 class Child(NamedTuple):
-    """A warm process, and the file that takes what it prints."""
+    """A warm process, and the file that receives what it prints."""
 
     process: subprocess.Popen
     printed: IO[bytes]
@@ -50,10 +51,11 @@ _waiting: list[Child] = []
 
 
 def isolated(work: Callable[..., Any], *arguments: Any, shown: str | Path, budget: Budget) -> Any:
-    """work(*arguments) in a child; the result is what JSON can say. `work` is a function of a module.
+    """Returns work(*arguments), computed in a child, as far as JSON can hold it. `work` is a function of a
+    module.
 
-    Raises ValueError and OSError as `work` does, and ValueError with a sentence about the file `shown` if the
-    call takes longer or needs more memory than its budget, or ends the process.
+    Raises ValueError and OSError as `work` does. Raises ValueError with a sentence about the file `shown` if
+    the call takes longer or needs more memory than its budget, or ends the process.
     """
     child = _take()
     call = pickle.dumps((os.getcwd(), budget, work, arguments))
@@ -71,7 +73,7 @@ def isolated(work: Callable[..., Any], *arguments: Any, shown: str | Path, budge
     except ValueError:
         reply = {}
     finally:
-        # also where a person ends the run: a child at its work is not left behind
+        # also if a person stops the run, so that no working child remains
         ended = (0, "")
         if reply.get("ready"):
             _waiting.append(child)
@@ -87,7 +89,7 @@ def isolated(work: Callable[..., Any], *arguments: Any, shown: str | Path, budge
 
 
 def _take() -> Child:
-    """A child that waits, or a new one."""
+    """Returns a waiting child, or a new one."""
     while _waiting:
         child = _waiting.pop()
         if child.process.poll() is None:
@@ -106,9 +108,9 @@ def _take() -> Child:
 
 
 def _end(child: Child) -> tuple[int, str]:
-    """Ends a child; its exit status, and the last line that it printed."""
+    """Ends a child. Returns its exit status, and the last line that it printed."""
     with contextlib.suppress(subprocess.TimeoutExpired):
-        # one that ended by itself has closed its pipes before it can be waited for
+        # a child that ended by itself closes its pipes a moment before wait() returns
         child.process.wait(timeout=1)
     child.process.kill()
     with contextlib.suppress(BrokenPipeError), child.process as process:
@@ -124,7 +126,7 @@ def _end(child: Child) -> tuple[int, str]:
 
 
 def _sentence(budget: Budget, no_memory: bool, status: int, last: str) -> str:
-    """Why a call gave nothing: the first that holds."""
+    """Returns why a call gave no result: the first reason that holds."""
     how = signal.Signals(-status).name if status < 0 else last[:200] or f"exit status {status}"
     reasons = (
         (
@@ -156,7 +158,7 @@ def _sentence(budget: Budget, no_memory: bool, status: int, last: str) -> str:
 
 
 def serve() -> None:
-    """Answers the calls on standard input until it is closed."""
+    """Answers the calls on standard input until it is closed, or until the child must be replaced."""
     calls, replies = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints is no reply
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
@@ -169,8 +171,8 @@ def serve() -> None:
 
 
 def _answer(replies: IO[bytes], budget: Budget, work: Callable[..., Any], arguments: tuple) -> bool:
-    """Replies with what one call gives. False if its memory ran out or much of it is kept: the next call
-    needs another child."""
+    """Replies with the result of one call. Returns False if the child ran out of memory or keeps much of it,
+    so that the next call needs another child."""
     base, reply = _data_mb(), {}
     _limit_memory(base + budget.largest_mb)
     signal.setitimer(signal.ITIMER_REAL, budget.longest_s)
@@ -200,7 +202,7 @@ def _limit_memory(largest_mb: float | None) -> None:
 
 
 def _data_mb() -> float:
-    """What this process has taken of private memory; 0 on a system that does not say."""
+    """Returns the private memory of this process in MB; 0 on a system that does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[5])
     except OSError:

@@ -1,10 +1,10 @@
-"""Klipper's log (klippy.log): what its Stats lines say of each heater, on the calendar, and the printer's own
-control in the configuration that the log repeats.
+"""Reads Klipper's log (klippy.log): the values of each heater in its Stats lines, on the calendar, and the
+printer's own control from the configuration that the log repeats.
 
-A line is read as Klipper's own scripts/graphstats.py reads it: words behind "Stats"; a word without "=" is
-the device that the following target, temp and pwm are of; a line without print_time is left out. Times count
-from the computer's start. "Start printer at ... (system time, that count)" puts them on the calendar.
-Part fan and filament feed are those of the printed G-code beside the log (printed_gcode).
+A line is read as in Klipper's own scripts/graphstats.py: words after "Stats"; a word without "=" is the
+device of the following target, temp and pwm; a line without print_time is left out. Times count from the
+computer's start. "Start printer at ... (system time, that count)" puts them on the calendar. Part fan and
+filament feed come from the printed G-code beside the log (printed_gcode).
 """
 
 import re
@@ -22,12 +22,12 @@ from pipeline.recordings.printed_gcode import Print, PrintRows, PrintSignals
 # Stats lines have some 1,500 characters; a longer line is no line of Klipper's
 LONGEST_LINE = 1 << 16
 MOST_DEVICES = 200
-# how often the size of what was read is looked at
+# the size of the table is checked after every this many lines
 LINES_A_CHECK = 10_000
 LONGEST_CONFIG = 20_000
-# sessions whose order in time is not known stand so far apart, in s: no gap limit joins them
+# sessions in unknown order are placed this far apart, in s, so that no gap limit joins them
 APART_S = 3600.0
-# Klipper divides its PID parameters by this: they are of a duty of 0 to 255
+# Klipper divides its PID parameters by this, because they are for a duty of 0 to 255
 PID_BASE = 255.0
 _STATS = (b"Stats", b"INFO:root:Stats")
 LATEST_S = 4e9  # the year 2096: beyond it a system time is none, and no count runs on so long
@@ -54,7 +54,7 @@ _QUEUE = (b"print_time", b"buffer_time", b"sd_pos")
 class PrinterPid(NamedTuple):
     """The printer's own PID of a heater, u = kp e + ki ∫e dt - kd dy/dt, u in percent of duty and e in °C.
 
-    The derivative is smoothed over `smooth_s`; u is cut to 0 ... `most_percent`.
+    The derivative is smoothed over `smooth_s`. u is limited to 0 ... `most_percent`.
     """
 
     heater: str
@@ -66,7 +66,8 @@ class PrinterPid(NamedTuple):
 
 
 class HeaterConfig(NamedTuple):
-    """A heater as the printer's configuration has it; `pid` is None for on-off control."""
+    """A heater in the printer's configuration. `pid` is None if its control is not a PID that can be read,
+    such as on-off."""
 
     heater: str
     control: str
@@ -77,18 +78,19 @@ class HeaterConfig(NamedTuple):
 
 
 class _Session(NamedTuple):
-    """A run of Klipper: its first row, and the system time at the count's zero, NaN if the log lacks it."""
+    """A run of Klipper: its first row, and the system time at the zero of its count, NaN if the log lacks
+    it."""
 
     first: int
     zero_s: float
 
 
 def load_klippy(path: Path) -> WholeTable:
-    """Temperature, target (°C), duty and fan speed (percent) of every device in the Stats lines.
+    """Returns temperature, target (°C), duty and fan speed (percent) of every device in the Stats lines.
 
     Columns are "extruder.temp", "extruder.target", "extruder.pwm"; and "part_fan.speed" (percent) and
-    "filament.feed" (mm/s) if the printed G-code lies beside the log. Raises ValueError for a log without a
-    Stats line of a heater.
+    "filament.feed" (mm/s) if the printed G-code is beside the log. Raises ValueError if the log has no Stats
+    line of a heater.
     """
     log = _read(path)
     if not log.times or not log.columns:
@@ -124,14 +126,14 @@ def load_klippy(path: Path) -> WholeTable:
 
 
 def printed_files(path: Path) -> list[Path]:
-    """The G-code files and histories beside a klippy.log that its fan and feed are from."""
+    """Returns the G-code files and histories from which a klippy.log's fan and feed are computed."""
     log = _read(path)
     time, order, _ = _on_calendar(np.frombuffer(log.times), log.sessions, {})
     return _print_signals(path, log, time, order).files if log.times else []
 
 
 def printer_heaters(path: Path) -> list[HeaterConfig]:
-    """The heaters of the last configuration in a klippy.log; none if it has no configuration."""
+    """Returns the heaters of the last configuration in a klippy.log; none if it has no configuration."""
     log = _Log()
     with path.open("rb") as stream:
         for line, text in _lines(stream):
@@ -153,7 +155,8 @@ def _read(path: Path) -> "_Log":
 
 
 def _lines(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """(number, text) of the lines. Of a line that is too long or has no end only the word Stats is left."""
+    """Yields (number, text) of the lines. From a line that is too long or has no end, only the word Stats is
+    kept."""
     number = 0
     while text := stream.readline(LONGEST_LINE):
         number += 1
@@ -169,7 +172,7 @@ def _is_stats(text: bytes) -> bool:
 
 
 class _Log:
-    """The columns that grow as the lines come in."""
+    """The columns that grow while the lines are read."""
 
     def __init__(self) -> None:
         self.times, self.lines, self.columns = array("d"), array("q"), {}
@@ -180,7 +183,8 @@ class _Log:
         self.first_garbled = self.first_undated = 0
         self.prints: list[Print] = []
         self.is_printing, self.is_over, self.position, self.opened = False, False, -1, ("", -1)
-        # of each row: buffer_time, position in the printed file, index of the print, whether it is being read
+        # for each row: buffer_time, position in the printed file, index of the print, whether it is being
+        # read
         self.buffers, self.positions = array("d"), array("q")
         self.print_index, self.reads = array("q"), array("b")
 
@@ -199,7 +203,7 @@ class _Log:
             self.add_config(line, text)
 
     def add_config(self, line: int, text: bytes) -> None:
-        """The last configuration in the log counts."""
+        """Adds a line of the configuration. Only the last configuration in the log is kept."""
         stripped = text.strip()
         if stripped == b"===== Config file =====":
             self.in_config, self.config = True, []
@@ -215,7 +219,7 @@ class _Log:
         elif finished:
             self.is_over = True  # the position follows
         elif what == b"Start":
-            # a print that goes on after a pause starts at the position where it stopped
+            # a print that continues after a pause starts at the position where it stopped
             if not (self.is_printing and int(position) == self.position and self.prints[-1].end < 0):
                 self._start_print(line, int(position))
             self.position = int(position)
@@ -229,8 +233,8 @@ class _Log:
         self.is_printing, self.is_over, self.opened = True, False, ("", -1)
 
     def _add_position(self, line: int, queue: dict[bytes, float]) -> None:
-        """Where Klipper is in the printed file. A position that falls, or comes without a start, is of
-        another print."""
+        """Adds Klipper's position in the printed file. A position that falls, or comes without a start,
+        belongs to another print."""
         position, buffer_s = queue.get(b"sd_pos", -1.0), queue.get(b"buffer_time", 0.0)
         reads = 0 <= position < 1e15
         if reads:
@@ -264,7 +268,7 @@ class _Log:
         if not 0 <= time < LATEST_S:
             self._count_garbled(line)
             return
-        # a count that falls without a start is another run, pasted behind
+        # a count that falls without a start is another run, pasted after this one
         if self.times and time < self.times[-1] and self.sessions[-1].first < len(self.times):
             self.sessions.append(_Session(len(self.times), np.nan))
             self.is_printing, self.position = False, -1
@@ -279,8 +283,8 @@ class _Log:
         self._add_position(line, queue)
 
     def _row(self, words: list[bytes]) -> tuple[dict[str, float], dict[bytes, float]]:
-        """The numbers of the devices, and those of the motion queue. Raises ValueError for text in place of a
-        number."""
+        """Returns the numbers of the devices, and those of the motion queue. Raises ValueError if a number is
+        text."""
         device, row, queue = b"", {}, {}
         for word in words:
             key, mark, value = word.partition(b"=")
@@ -328,7 +332,8 @@ class _Log:
 def _on_calendar(
     counts_s: np.ndarray, sessions: list[_Session], values: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, list[Note]]:
-    """(time, rows in the order of time, notes): time_ns where a start gives the calendar, else time_s."""
+    """Returns (time, rows in the order of time, notes): time_ns if a start gives the calendar, otherwise
+    time_s."""
     starts = [session.first for session in sessions] + [len(counts_s)]
     pieces = [
         (np.arange(a, b), session.zero_s)
@@ -352,8 +357,8 @@ def _on_calendar(
 def _zeros(
     pieces: list[tuple[np.ndarray, float]], counts_s: np.ndarray, values: dict[str, np.ndarray]
 ) -> np.ndarray:
-    """The system time at zero of each run; a run without a start takes that of a neighbour whose count runs
-    on, as the computer was not started anew between them, or which it repeats."""
+    """Returns the system time at zero of each run. A run without a start takes the zero of a neighbour if the
+    count continues between them (the computer was not restarted), or if it repeats that run."""
     zeros = np.array([zero for _, zero in pieces])
     for i in range(1, len(pieces)):
         before, first = pieces[i - 1][0], pieces[i][0][0]
@@ -367,15 +372,15 @@ def _zeros(
 
 
 def _repeats(row: int, before: np.ndarray, counts_s: np.ndarray, values: dict[str, np.ndarray]) -> bool:
-    """Whether a row stands among the rows `before` too, with the same count and values."""
+    """Returns whether a row also exists among the rows `before`, with the same count and values."""
     at = before[min(np.searchsorted(counts_s[before], counts_s[row] - 0.05), len(before) - 1)]
     same = [np.array_equal(column[at], column[row], equal_nan=True) for column in values.values()]
     return abs(counts_s[at] - counts_s[row]) < 0.05 and all(same)
 
 
 def _sorted(pieces, zeros: np.ndarray, counts_s: np.ndarray, notes: list[Note]):
-    """(rows, times) of all runs in the order of time. A run whose time is not known follows the one ahead of
-    it in the file, an hour later."""
+    """Returns (rows, times) of all runs in the order of time. A run with unknown time follows the previous
+    one in the file, an hour later. If there is no previous one, it is placed before the others."""
     placed, end = [], np.nan
     for (rows, _), zero in zip(pieces, zeros, strict=True):
         times = counts_s[rows] + (0.0 if np.isnan(zero) else zero)
@@ -400,7 +405,8 @@ def _sorted(pieces, zeros: np.ndarray, counts_s: np.ndarray, notes: list[Note]):
 
 
 def _without_repeats(rows: np.ndarray, times: np.ndarray, values: dict[str, np.ndarray], notes: list[Note]):
-    """Lines that stand twice (a log and its rollover in one file) count once."""
+    """Returns rows and times with each time once. Lines that exist twice (a log and its rollover in one file)
+    are counted in a note, and so are other lines with the time of another."""
     close = np.r_[False, np.diff(times) < 0.05]  # times have one decimal
     same = np.zeros(len(rows), bool)
     for i in np.flatnonzero(close):
@@ -420,7 +426,7 @@ def _without_repeats(rows: np.ndarray, times: np.ndarray, values: dict[str, np.n
 
 
 def _print_signals(path: Path, log: _Log, time: np.ndarray, order: np.ndarray) -> PrintSignals:
-    """Part fan and feed at the rows in the order of time."""
+    """Returns part fan and feed at the rows in the order of time."""
     on_calendar = time.dtype == np.int64
     start_s = float(time[0] / 1e9 if on_calendar else time[0])
     rows = PrintRows(
@@ -435,8 +441,8 @@ def _print_signals(path: Path, log: _Log, time: np.ndarray, order: np.ndarray) -
 
 
 def fan_macros(lines: list[str]) -> dict[str, float]:
-    """{name: percent} of the macros of a configuration that set the part fan to a number, by their last
-    command for it."""
+    """Returns {name: percent} of the macros in a configuration that set the part fan to a number; a macro's
+    last command for it counts."""
     macros, name = {}, ""
     for line in lines:
         if section := re.match(r"\s*\[(?:gcode_macro\s+(\w+)|[^\]]*)\s*\]", line):
@@ -451,8 +457,8 @@ def fan_macros(lines: list[str]) -> dict[str, float]:
 
 
 def heater_configs(lines: list[str]) -> list[HeaterConfig]:
-    """The heaters of a configuration, as Klipper writes it into its log. A value that is no number counts as
-    missing."""
+    """Returns the heaters of a configuration, as Klipper writes it into its log. A value that is not a number
+    counts as missing."""
     sections: dict[str, dict[str, str]] = {}
     keys: dict[str, str] = {}
     for line in lines:

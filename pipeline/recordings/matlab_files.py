@@ -1,8 +1,8 @@
-"""MATLAB files of versions 5 to 7: vectors, matrices and structures of one length as columns.
+"""Reads MATLAB files of versions 5 to 7: vectors, matrices and structures of one length as columns.
 
-Layout: MathWorks, "MAT-File Format", level 5. (scipy.io.loadmat 1.17 ended the child by SIGSEGV for 2 of 84
-garbled files and for deeply nested cells, and read a matrix of negative size. This reader checks every length
-against what is there, and ended no child.)
+Layout: MathWorks, "MAT-File Format", level 5. (scipy.io.loadmat 1.17 ended the child process by SIGSEGV for 2
+of 84 garbled files and for deeply nested cells, and read a matrix of negative size. This reader checks every
+length against the bytes that exist, and ended no child process.)
 """
 
 import math
@@ -46,10 +46,10 @@ class _Broken(ValueError):
 
 
 def load_matlab(path: Path) -> WholeTable:
-    """The numbers of the most common length in the file; the columns of a matrix X are X_1, X_2, ...
+    """Returns the arrays of the most common length in the file. The columns of a matrix X are X_1, X_2, ...
 
-    A structure's parts are "log.T1". The clock is the vector with the name of a time, if there is one. Raises
-    ValueError for a damaged file and for one without two samples of anything.
+    A structure's parts are "log.T1". The clock is a vector with the name of a time, if there is one. Raises
+    ValueError if the file is damaged, or if nothing in it has two samples.
     """
     arrays, no_columns, count = {}, {}, 0
     with path.open("rb") as stream:
@@ -60,7 +60,7 @@ def load_matlab(path: Path) -> WholeTable:
             count += numbers.size
             check_values(path, count, 1)
             arrays[name] = numbers.squeeze()
-    # the length that most arrays have along their longest side; of equally many the longer
+    # the length that most arrays have along their longest side; the longer one if equally many have it
     lengths = [max(array.shape) for array in arrays.values() if array.ndim in (1, 2) and array.size]
     length = max(lengths, key=lambda length: (lengths.count(length), length), default=0)
     if length < 2:
@@ -84,7 +84,8 @@ def load_matlab(path: Path) -> WholeTable:
 
 
 def _with_clock(values: dict[str, np.ndarray], no_columns: dict[str, str]) -> WholeTable:
-    """The table on the clock of the first vector that has the name of a time and runs forward."""
+    """Returns the table on the clock of a vector that has the name of a time and runs forward. Of several,
+    the shortest name is used."""
     notes: list[Note] = []
     forward = [
         name
@@ -110,7 +111,7 @@ def _with_clock(values: dict[str, np.ndarray], no_columns: dict[str, str]) -> Wh
 
 
 def _own_clock(name: str, clocks: list[str]) -> str:
-    """The clock of the innermost structure around `name` that has one, "" for none."""
+    """Returns the clock of the innermost structure around `name` that has one, "" for none."""
     around = [clock for clock in clocks if "." in clock and name.startswith(clock.rpartition(".")[0] + ".")]
     return max(around, key=lambda clock: clock.count("."), default="")
 
@@ -119,7 +120,8 @@ def _own_clock(name: str, clocks: list[str]) -> str:
 
 
 def _parts(path: Path, stream: BinaryIO) -> Iterator[_MatlabPart]:
-    """The parts of every variable. Raises ValueError with the place of a variable that cannot be read."""
+    """Yields the parts of every variable. Raises ValueError with the place of a variable that cannot be
+    read."""
     size, unpacked, count = path.stat().st_size, 0, 0
     order = {b"IM": "<", b"MI": ">"}.get(stream.read(128)[126:128], "<")
     while len(tag := stream.read(8)) == 8:
@@ -149,7 +151,7 @@ def _parts(path: Path, stream: BinaryIO) -> Iterator[_MatlabPart]:
 
 
 def _unpack(packed: bytes, room: int, order: str) -> memoryview:
-    """The matrix in a compressed variable."""
+    """Returns the matrix in a compressed variable."""
     unpacker = zlib.decompressobj()
     content = unpacker.decompress(packed, room + 9)
     if len(content) > room:
@@ -163,7 +165,7 @@ def _unpack(packed: bytes, room: int, order: str) -> memoryview:
 
 
 def _elements(data: memoryview, order: str) -> Iterator[_Element]:
-    """The elements one behind the other; a short one has its data in its tag."""
+    """Yields the elements one after the other. A short element has its data in its tag."""
     pos = 0
     while pos + 8 <= len(data):
         kind, length = struct.unpack_from(order + "II", data, pos)
@@ -189,7 +191,8 @@ def _next_numbers(elements: Iterator[_Element], order: str) -> np.ndarray:
 
 
 def _variable(data: memoryview, order: str, above: str, depth: int) -> Iterator[_MatlabPart]:
-    """The parts of a matrix; `above` is the name of what holds it."""
+    """Yields the parts of a matrix. `above`: its full name if a structure or a cell array contains it,
+    otherwise ""."""
     elements = _elements(data, order)
     flags, dims = _next_numbers(elements, order), _next_numbers(elements, order)
     _, own = next(elements, (0, b""))
@@ -224,7 +227,8 @@ def _numeric(name: str, numbers: np.ndarray, shape: tuple[int, ...], is_complex:
 def _inner(
     elements: Iterator[_Element], order: str, name: str, kind: int, depth: int
 ) -> Iterator[_MatlabPart]:
-    """The parts of a cell array or of a structure, whose fields follow each other in every entry."""
+    """Yields the parts of a cell array or of a structure. In a structure the fields follow each other in
+    every entry."""
     fields: list[str] = []
     if kind != _CELL:
         if kind == _OBJECT:

@@ -45,26 +45,26 @@ RECORD_HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 CHUNK_HEAD = struct.Struct("<QQQII")
 FOOTER_RECORD = struct.Struct("<BQQQI")
-# (in the lookahead: a wrong start must not hide a right one in the bytes behind it)
+# (in a lookahead, so that a false start does not hide a true one in the bytes after it)
 _CHUNK_START = re.compile(
     rb"\x06(?=(.{8}).{28}(\x00\x00\x00\x00|\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)(.{8}))", re.DOTALL
 )
-# packed or not; recorders close a chunk at 1 to 64 MB
+# bytes, compressed or not; recorders close a chunk at 1 to 64 MB
 LARGEST_CHUNK = 1 << 29
-# messages outside chunks are handed on in groups of that many bytes
+# messages outside chunks are yielded in groups of this many bytes
 GROUP_BYTES = 1 << 20
-# the first messages of a channel, which tell its fields
+# number of first messages of a channel from which its fields are found
 SAMPLES = 20
-# a summary may promise what is not there
+# a summary may declare more messages than exist
 MOST_EXPECTED = 1 << 26
-# a network brings messages out of order now and then; two publishers with clocks of their own do all the time
+# a network brings a few messages out of order; two publishers with different clocks do so all the time
 OUT_OF_ORDER = 0.05
-# a lost chunk that says it lasted so many times longer than all others together is not believed
+# a lost chunk's duration is ignored if it is this many times longer than that of all others together
 LONGEST_CHUNK = 10
-# (seconds, nanoseconds) as the fields of a time stamp are called in ROS 2, Foxglove JSON, ROS 1 and protobuf
+# names of the fields (seconds, nanoseconds) of a time stamp in ROS 2, Foxglove JSON, ROS 1 and protobuf
 _STAMPS = (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "nanos"))
 LARGEST_METADATA = 1 << 20
-# between the parts of one bag
+# longest pause between the parts of one bag
 LONGEST_PAUSE_S = 60.0
 # how text-mode copying changes the magic
 _CONVERSIONS = {
@@ -73,7 +73,7 @@ _CONVERSIONS = {
     b"\x89MCAP0\r\x0b": "CR LF",
     b"\x89MCAP0\r": "CR LF to CR",
 }
-# the length of a record that has always the same
+# lengths of records that always have the same length
 _LENGTHS = {Opcode.FOOTER: 20, Opcode.DATA_END: 4}
 ENDS = "the file ends in it"
 # kind of the note and its sentence
@@ -102,8 +102,9 @@ def _note(name: str, count: int = 1, **values: Any) -> Note:
 
 
 class Messages(NamedTuple):
-    """Messages of one channel in the order of the file: times in ns, the bytes of each message (empty if the
-    channel is not wanted), and the offsets of the chunks, or of the single messages, that hold them."""
+    """Messages of one channel in the order of the file. `log_time`: ns; `publish_time` (ns) and `data`: both
+    lists are empty if the channel is not wanted; `offsets`: of the chunks, or of the single messages, that
+    hold them."""
 
     log_time: list[int]
     publish_time: list[int]
@@ -245,7 +246,7 @@ class _Walk:
                 if opcode == Opcode.FOOTER:
                     return
                 continue
-            # 0: room that the recorder has taken but not filled
+            # 0: space that the recorder has reserved but not filled
             if self.waits and (reason == ENDS or head[0] == 0):
                 return
             chunk = body or stream.read(CHUNK_HEAD.size) if head[0] == CHUNK else b""
@@ -336,7 +337,7 @@ class McapFile(_Walk):
                 self.define(opcode, body)
                 if opcode == Opcode.STATISTICS:
                     statistics = _parse(records.Statistics, body)
-                    # a writer may leave out what each channel has
+                    # a writer may leave out the counts of the channels
                     if statistics.channel_message_counts or not statistics.message_count:
                         self.promised = statistics.channel_message_counts
         except (struct.error, UnreadableMessage):
@@ -636,7 +637,7 @@ def topics(path: Path, samples: int = SAMPLES) -> dict[str, Topic]:
             break
     for number in set(file.channels) - set(counts):
         look(number, [])
-    # the counts are whole if every message was looked at, else those of the summary
+    # the counts are complete if every message was read; otherwise the summary's counts are used
     totals = file.counts if samples > SAMPLES else file.promised or file.counts
     return merge_topics(
         {
@@ -807,7 +808,7 @@ def _stamps(clock: Sequence[str], stamps: np.ndarray) -> np.ndarray:
     """Returns the times in ns (n,) from the values of the clock's fields (n, 1 or 2)."""
     if len(clock) == 1:
         return np.rint(seconds(clock[0].rpartition(".")[2], stamps[:, 0])[0] * 1e9).astype(np.int64)
-    # both parts are whole numbers below 2^53, so that floats hold them and the nanoseconds are exact
+    # both parts are whole numbers below 2^53, so floats hold them and the nanoseconds are exact
     parts = stamps.astype(np.int64)
     return parts[:, 0] * 10**9 + parts[:, 1]
 
@@ -877,7 +878,7 @@ def _places(path: Path, sources: Sequence[str]) -> tuple[dict[str, tuple[str, st
     try:
         return {source: resolve(path, source, by_name) for source in sources}, by_name
     except ValueError:
-        # a key that JSON messages get later than the first ones
+        # perhaps a key that does not occur in the first JSON messages
         by_name = topics(path, MOST_EXPECTED)
         return {source: resolve(path, source, by_name) for source in sources}, by_name
 

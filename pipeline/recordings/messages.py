@@ -38,7 +38,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from google.protobuf.message import DecodeError, Message
 
 LARGEST_MESSAGE = 1 << 28
-# the longest in use have some 100 kB
+# the longest schemas in use have about 100 kB
 LARGEST_SCHEMA = 4 << 20
 ENCODINGS = "cdr with ros2msg, ros1 with ros1msg, protobuf, and json"
 _ZSTD, _LZ4 = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"
@@ -265,14 +265,14 @@ ROS2_NUMBERS = {
 }  # fmt: skip
 ROS1_NUMBERS = {**ROS2_NUMBERS, "byte": "b"}
 ROS1_NUMBERS.pop("octet")
-# types that many schema texts leave out, as every reader has them
+# types that many schema texts leave out, because every reader knows them
 KNOWN = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
     "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
     "ros1/time": "uint32 secs\nuint32 nsecs",
     "ros1/duration": "int32 secs\nint32 nsecs",
 }
-# numbers of one array: no message is as long as that
+# most numbers of one array; no message is that long
 LARGEST_ARRAY = 1 << 30
 _FIELD = re.compile(r"^([A-Za-z]\w*(?:/\w+)*)(?:<=\d+)?\s*(\[(?:<=)?(\d*)\])?\s+([A-Za-z]\w*)\s*(=?)")
 # representation -> byte order, largest alignment; ROS does not write lists of parameters (0x0002, 0x0003 and
@@ -283,7 +283,7 @@ _REPRESENTATIONS = {
     b"\x00\x06": (">", 4),
     b"\x00\x07": ("<", 4),
 }
-# so many messages are worth a format of their own
+# from this many messages on, a common format is worth making
 FEWEST_ALIKE = 4
 _LENGTH = {order: struct.Struct(order + "I") for order in "<>"}
 
@@ -455,7 +455,7 @@ def _readable(items: Sequence[Item]) -> list[Item]:
 
 
 # the names of the numbers that a step reads, and a function (message, position, numbers so far) -> position
-# behind it
+# after the step
 Step = tuple[list[str], Callable[[bytes, int, list[float]], int]]
 
 
@@ -589,7 +589,7 @@ def ros_decoder(
     exact = len(readable) == len(items)
     has_sequence = any(item.kind == "sequence" for item in readable)
     representations = _REPRESENTATIONS if version == 2 else {b"": ("<", 1)}
-    # alignment counts from behind the header of four bytes, and so many bytes of padding may follow
+    # alignment counts from the end of the header of four bytes, and up to `padding` bytes may follow
     header, padding = (4, 7) if version == 2 else (0, 0)
     programs = {code: _program(readable, wanted, *how) for code, how in representations.items()}
     columns = _order(next(iter(programs.values())), names)
@@ -681,7 +681,7 @@ def _run(data: bytes, steps: list[Step], exact: bool, padding: int) -> list[floa
 
 # ---- protobuf
 
-# what every compiler of protobuf brings along, and some recorders leave out
+# files that every protobuf compiler includes, and some recorders leave out
 _WELL_KNOWN = {
     module.DESCRIPTOR.name: module.DESCRIPTOR
     for module in (any_pb2, duration_pb2, empty_pb2, struct_pb2, timestamp_pb2, wrappers_pb2)
@@ -690,7 +690,7 @@ _FILES, _FILE = (
     message_factory.GetMessageClass(descriptor_pb2.DESCRIPTOR.message_types_by_name[name])
     for name in ("FileDescriptorSet", "FileDescriptorProto")
 )
-# a message that holds itself has no end, and one with a few levels of many messages nearly none
+# a message that contains itself never ends, and a few levels of many messages nearly never
 _DEEPEST, _MOST_FIELDS = 6, 20_000
 
 Types = dict[str, Descriptor]
@@ -833,7 +833,7 @@ def _steps(message: Descriptor, path: str) -> list[FieldStep]:
             raise ValueError(f"no numeric field {path}")
         index = -1 if match[2] == "#" else None if match[2] is None else int(match[2])
         steps.append((field.name, field.has_presence, index))
-        # behind the length, and in a map, there is nothing
+        # nothing follows the length, and a map has no numbered entries
         kind = field.message_type if index != -1 and _is_message(field) else None
     if field is None or (steps[-1][2] != -1 and not _is_number(field)):
         raise ValueError(f"no numeric field {path}")

@@ -1,4 +1,4 @@
-"""Numbers that stand for a missing value: what loggers, converters and sensors write in its place."""
+"""Finds numbers that loggers, converters and sensors write instead of a missing value."""
 
 import numpy as np
 
@@ -14,18 +14,19 @@ FEWEST = 2  # a code repeats exactly
 LARGEST_SHARE = 0.5
 # a signal of fewer levels is a plan, a state or a set-point, in which 85 is as good as any
 FEWEST_LEVELS = 12
-# a code is further from the values around it than so many of their own largest steps
+# a code differs from its neighbours by more than this many of the signal's largest steps
 JUMP_OVER_STEPS = 3.0
 # the signal itself may be near the code now and then
 JUMPING_SHARE = 0.85
 
 
 def missing_codes(values: np.ndarray) -> list[float]:
-    """The codes for missing values among the finite values (n,) of a signal, in their order of time.
+    """Returns the codes for missing values among the finite values (n,) of a signal, in the order in which
+    they first appear.
 
-    A sentinel such as -9999 counts if it repeats and lies outside the others by more than their range.
+    A sentinel such as -9999 counts if it repeats and lies outside the other values by more than their range.
     Another number counts if the signal jumps there and back, nearly each time by more than JUMP_OVER_STEPS of
-    the largest steps of the others, which have many levels.
+    the largest steps of the other values. These must have many levels.
     """
     candidates = np.isin(values, _CODES)
     if not candidates.any():
@@ -45,7 +46,7 @@ def missing_codes(values: np.ndarray) -> list[float]:
 
 
 def _jumps(values: np.ndarray, at: np.ndarray, ordinary: np.ndarray) -> bool:
-    """Whether stretches of a code begin and end with a jump that the ordinary values never make."""
+    """Returns whether stretches of a code begin and end with a jump that the ordinary values never make."""
     steps = np.abs(np.diff(ordinary))
     resting = np.mean(steps == 0) > 0.9
     if resting or len(np.unique(ordinary)) <= FEWEST_LEVELS:

@@ -47,11 +47,11 @@ from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
 
 CLASSES = ("under (flow below 90 %)", "good (90 to 110 %)", "over (above 110 %)")
-# frames that one worker cuts at a time, and that the memo keeps together
+# number of frames that one worker crops at a time, and that the memo keeps together
 TOGETHER = 256
-# lines that tell where a file's images are
+# about this many lines are used to find where a file's images are
 LOOKED_AT = 2000
-# endings of what is written about recordings, and the longest path that is shown
+# endings of texts about recordings, and the longest path that is shown
 TEXTS, LONGEST = {".md", ".txt", ".html", ".yaml", ".yml", ".dvc", ""}, 200
 REPEATED, COPY = "an earlier line lists the image", "the frame is a copy of another"
 NO_FLOW, NO_TEMPERATURE, NO_PRINT, NO_NAME = (
@@ -73,25 +73,25 @@ REMEDIES = {
 }
 LOOK = "look at a few with ./run beadline calibrate tip IMAGE --tip X,Y"
 ROWS_AT_ONCE = 10_000
-# what a printer can be told; beyond it the column is another one, or in another unit
+# the range of a printer's settings; a value beyond it is another column, or in another unit
 FLOW_PERCENT, TEMPERATURE_DEGC = (0.0, 1000.0), (0.0, 600.0)
 LABELS = "flow_rate_class"
 DIRECTION = "travel_direction_deg"
-# what is lived without, and how
+# optional columns, and what replaces them
 OPTIONAL = {
     "print_id": "the file is one print",
     "nozzle_tip_x": "the tip is that of the settings",
     "timestamp": "the order of the rows is not checked",
     DIRECTION: "the travel direction is that of the ground, if it is seen to move, or of the only line",
 }
-# beside flow and target temperature, what is constant within a segment where the file has it
+# columns that, like flow and target temperature, are constant within a segment if the file has them
 SETTINGS = ("feed_rate", "z_offset")
 COLUMNS = {"img_path", "flow_rate", "target_hotend", "hotend", "nozzle_tip_y", LABELS, *OPTIONAL, *SETTINGS}
-# beside what others write where they have nothing: a time of pandas
+# texts for an empty field, with that of pandas for a time
 NOTHING = {*NOTHING_WRITTEN, "nat"}
 # the section of params.yaml with our signals' places in a recording
 PLACE = "params.yaml: train_classifier.topics"
-# our signals and their units; where the mapping says nothing, the only field of that name
+# our signals and their units; a signal that is not mapped comes from the only field of that name
 UNITS = {
     "flow_percent": "percent",
     "temperature_degC": "degC",
@@ -101,7 +101,7 @@ UNITS = {
     "travel_direction_deg": "deg",
 }
 NEEDED = ("flow_percent", "temperature_degC")
-# a temperature that changes more often than this, and than in one of so many frames, is no setpoint
+# a temperature is no setpoint if it changes more often than this, and in more than one of this many frames
 MEASURED = 20
 # frames of a recording in memory at a time
 AT_ONCE = 64

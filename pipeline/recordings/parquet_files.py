@@ -1,4 +1,4 @@
-"""Parquet files of other people's programs, read a part at a time."""
+"""Reads Parquet files of other programs, part by part."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -40,7 +40,7 @@ def _parquet(path: Path) -> pq.ParquetFile:
 
 
 def _first_line(error: Exception) -> str:
-    """The first line of an error, which may hold a whole value of the file."""
+    """Returns the first line of an error, which may contain a whole value of the file."""
     return str(error).strip().splitlines()[0][:200]
 
 
@@ -51,7 +51,7 @@ def _flat(table: pa.Table) -> pa.Table:
 
 
 def _plain(kind: pa.DataType) -> pa.DataType:
-    """The type of a column's values; those of a category are in its dictionary."""
+    """Returns the type of a column's values. For a category it is that of its dictionary."""
     return kind.value_type if pa.types.is_dictionary(kind) else kind
 
 
@@ -66,7 +66,7 @@ def _is_numeric(kind: pa.DataType) -> bool:
 
 
 def parquet_columns(path: Path) -> list[FileColumn]:
-    """The columns of a Parquet file. The parts of a structure are "a.b"."""
+    """Returns the columns of a Parquet file. The parts of a structure are "a.b"."""
     columns = []
     for name, field in _leaves(_parquet(path).schema_arrow, ""):
         kind = (
@@ -102,8 +102,8 @@ def _leaves(fields: pa.Schema | pa.StructType, prefix: str) -> Iterator[tuple[st
 
 
 def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[FileColumns, list[Note]]:
-    """The wanted columns, NaN for null. Raises ValueError for a column that is missing or holds no numbers,
-    and for a damaged file."""
+    """Returns the wanted columns, NaN for null, and notes. Raises ValueError if a column is missing or holds
+    no numbers, or if the file is damaged."""
     file, columns = _parquet(path), parquet_columns(path)
     types = {name: field.type for name, field in _leaves(file.schema_arrow, "")}
     names = [column.name for column in columns]
@@ -145,7 +145,7 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[FileColu
 def _check_one_signal(
     path: Path, file: pq.ParquetFile, types: dict[str, pa.DataType], wanted: Sequence[str]
 ) -> None:
-    """Raises ValueError for a table whose rows are of several signals."""
+    """Raises ValueError if a table's rows belong to several signals."""
     for name in naming_columns(list(types), wanted):
         if not _is_text(types[name]):
             continue
@@ -162,7 +162,7 @@ def _check_one_signal(
 
 
 def _values(path: Path, file: pq.ParquetFile, kinds: dict[str, type], clock: str) -> dict[str, np.ndarray]:
-    """{name: values (n,)} of the columns `kinds` {name: int64 or float}."""
+    """Returns {name: values (n,)} of the columns `kinds` {name: int64 or float}."""
     columns = sorted({name.split(".")[0] if "." in name else name for name in kinds} | set(kinds))
     try:
         # a table in one piece is not copied
@@ -225,7 +225,7 @@ def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.nda
 
 
 def _iso_ns(path: Path, name: str, column: pa.ChunkedArray) -> np.ndarray:
-    """ns since 1970 of times written as text, which must be dates and times of ISO 8601."""
+    """Returns ns since 1970 for times written as text, which must be dates and times of ISO 8601."""
     texts = column.to_pylist()
     if missing := texts.count(None):
         raise ValueError(f"{path}: time {name} is missing in {missing} rows; remove them")

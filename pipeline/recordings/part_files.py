@@ -1,4 +1,4 @@
-"""Part programs in a folder, and the measured prints beside them."""
+"""Reads part programs in a folder, and the measured prints in it."""
 
 import csv
 from pathlib import Path
@@ -20,7 +20,7 @@ Series = tuple[np.ndarray, np.ndarray]
 
 
 def part_programs(folder: Path) -> list[Path]:
-    """The part programs in a folder, by name. Raises ValueError if there is none."""
+    """Returns the part programs in a folder, by name. Raises ValueError if there is none."""
     paths = sorted(
         path for path in folder.glob("*") if path.suffix.lower() in {".gcode", ".gco", ".g", ".nc"}
     )
@@ -30,7 +30,8 @@ def part_programs(folder: Path) -> list[Path]:
 
 
 def read_part_program(path: Path) -> bytes:
-    """The bytes of a part program. Raises ValueError for what is no plain file, or too large."""
+    """Returns the bytes of a part program. Raises ValueError if it is not a plain file, is too large, or
+    cannot be read."""
     check_plain_file(path)
     try:
         size = path.stat().st_size / 1e6
@@ -48,13 +49,13 @@ def read_part_program(path: Path) -> bytes:
 
 
 def print_name(part: str, material: str, ending: str = ".csv") -> str:
-    """The file that holds the measured flow of a part's print."""
+    """Returns the name of the file that holds the measured flow of a part's print."""
     return f"{part}_{material}_measured{ending}"
 
 
 def print_path(folder: Path, part: str, material: str) -> Path | None:
-    """The file in `folder` with the measured flow of a part's print, whatever its form; None if there is
-    none. Raises ValueError if there are two."""
+    """Returns the file in `folder` with the measured flow of a part's print, in any of its formats; None if
+    there is none. Raises ValueError if there are several."""
     paths = [folder / print_name(part, material, ending) for ending in ENDINGS]
     present = [path for path in paths if path.exists()]
     if len(present) > 1:
@@ -66,10 +67,10 @@ def print_path(folder: Path, part: str, material: str) -> Path | None:
 
 
 def read_measured(path: Path, samples: int, sample_time_s: float) -> tuple[np.ndarray, np.ndarray | None]:
-    """Flow y (samples,) in mm^3/s of a measured print at the clock of the command, NaN before the first,
-    after the last row and in gaps longer than five samples; and the command u (samples,) in mm that was
-    printed, None if the file does not have it. Time 0 is where the command begins: of a table as it stands,
-    of an MCAP recording the first message of the plunger. Raises ValueError naming file and place."""
+    """Returns the flow y (samples,) in mm^3/s of a measured print at the clock of the command, and the
+    printed command u (samples,) in mm, None if the file does not have it. y is NaN before the first row,
+    after the last row and in gaps longer than five samples. At time 0 the command begins: in a table its time
+    0, in an MCAP recording the plunger's first message. Raises ValueError naming file and place."""
     flow, command = _rows(path) if path.suffix == ".csv" else _read_recorded(path)
     t, y = flow
     clock = np.arange(samples) * sample_time_s
@@ -85,7 +86,7 @@ def read_measured(path: Path, samples: int, sample_time_s: float) -> tuple[np.nd
 
 
 def _read_recorded(path: Path) -> tuple[Series, Series | None]:
-    """Flow and, where it has one, command of a Parquet table or an MCAP recording."""
+    """Returns flow and, if it has one, command of a Parquet table or an MCAP recording."""
     kind, wanted = file_format(path), [Source(COLUMNS[1], COLUMNS[1], "mm^3/s")]
     if kind == "mcap":
         plunger = topics(path).get(COMMAND_TOPIC.source.partition(":")[0])
@@ -114,7 +115,7 @@ def _read_recorded(path: Path) -> tuple[Series, Series | None]:
 
 
 def _rows(path: Path) -> tuple[Series, Series | None]:
-    """Flow and, where it has one, command of a CSV table."""
+    """Returns flow and, if it has one, command of a CSV table."""
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))
     names = tuple(name.strip() for name in rows[0]) if rows else ()

@@ -1,11 +1,12 @@
-"""What lies among recordings and is none: pipes, sockets, devices, and links that lead out of the folder.
+"""Refuses things among recordings that are not recordings: pipes, sockets, devices, and links that lead out
+of the folder.
 
-A pipe without a writer stops whoever opens it, `dvc status` too. A link out of the folder is a recording that
-changes, or is gone, without anybody having touched the folder. So both are refused by name before anything is
-opened. For recordings that lie on another disk, datasets/raw, datasets/raw/<loop> and folders of images
-directly below datasets/raw/setpoint may be links.
+A pipe without a writer blocks every program that opens it, `dvc status` too. A link out of the folder is a
+recording that may change or vanish although nobody touched the folder. Both are therefore refused by name
+before anything is opened. Recordings may be on another disk: datasets/raw, datasets/raw/<loop> and folders of
+images directly below datasets/raw/setpoint may be links.
 
-Copies that are not complete are passed over: a name tells, or a change a moment ago.
+Incomplete copies are passed over. They are recognised by their names, or by a change a moment ago.
 """
 
 import os
@@ -14,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-# a file that has not changed for so long is complete
+# a file that has not changed for this long is complete
 REST_S = 10.0
 # endings of downloads and copies, an open workbook's lock, and what systems leave in folders
 _PARTIAL_ENDS = (".part", ".partial", ".crdownload", ".download", ".filepart")
@@ -28,8 +29,8 @@ _KINDS = (
 
 
 def check_plain_files(folder: str | Path) -> None:
-    """Raises ValueError, naming the first, if something below `folder` is neither a file nor a folder, or a
-    link that leads out of it."""
+    """Raises ValueError, naming the first, if something below `folder` is neither a file nor a folder, or is
+    a link that leads out of it."""
     problems = list(_problems(Path(folder), Path(folder).resolve()))
     if problems:
         suffix = f" (and {len(problems) - 1} more like it)" if len(problems) > 1 else ""
@@ -66,8 +67,8 @@ def _link(path: Path, top: Path) -> Iterator[str]:
         yield f"{path} is a link to {os.readlink(path)}, which is not there; remove the link"
         return
     if not target.is_relative_to(top):
-        # a folder of datasets/raw is the whole of a loop's recordings; those of images come by the hundred
-        # thousand, and their reader follows links to folders
+        # a folder of datasets/raw holds all recordings of a loop. Images come by the hundred thousand, and
+        # their reader follows links to folders
         whole_loop = path.parent.resolve() == top and top.name == "raw"
         if target.is_dir() and (whole_loop or path.parent.name == "setpoint"):
             yield from _problems(path, target)
@@ -93,7 +94,7 @@ def _special(path: Path, mode: int) -> Iterator[str]:
 
 
 def is_partial(name: str) -> bool:
-    """Whether a file's name is that of a copy that is not complete, or of a system's own file."""
+    """Returns whether a file's name is that of an incomplete copy, or of a system's own file."""
     lower = name.lower()
     return lower.endswith(_PARTIAL_ENDS) or lower.startswith("~$") or lower in _PARTIAL_NAMES
 
@@ -105,8 +106,9 @@ def wait_until_still(
     clock: Callable[[], float] = time.time,
     sleep: Callable[[float], None] | None = None,
 ) -> list[Path]:
-    """Waits until no file has changed for `rest_s` (default REST_S), for `rest_s` at most; those that changed
-    meanwhile are still being written. A change in the future, of a clock set wrong, is not waited for."""
+    """Waits until no file has changed for `rest_s` (default REST_S), but `rest_s` at most. Returns the files
+    that changed meanwhile and are still being written. A change in the future, from a wrong clock, is not
+    waited for."""
     rest_s = REST_S if rest_s is None else rest_s
     states = {path: _state(path) for path in paths}
     now_s = clock()
@@ -119,7 +121,8 @@ def wait_until_still(
 
 
 def _state(path: Path) -> dict[Path, tuple[float, int]]:
-    """{file: (time of change in s, bytes)} of a file, or of those of a bag; empty if it is gone."""
+    """Returns {file: (time of change in s, bytes)} of a file, or of the files of a bag; empty if it is
+    gone."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     try:
         return {file: (status.st_mtime, status.st_size) for file in files for status in [file.stat()]}

@@ -1,19 +1,20 @@
-"""Positions in a printed G-code file -> part fan in percent and filament feed in mm/s, on the clock of a
-klippy.log.
+"""Computes part fan in percent and filament feed in mm/s from the positions in a printed G-code file, on the
+clock of a klippy.log.
 
-Klipper writes up to which byte it has run the printed file (sd_pos), and how far the planned motion is ahead
-of now (buffer_time). The lines before that byte have moved when the planned motion is over:
+Klipper logs up to which byte it has run the printed file (sd_pos), and how far the planned motion is ahead of
+now (buffer_time). The lines before that byte have moved when the planned motion is over:
 
     E(t + buffer_time(t)) = E of the lines before sd_pos(t)
     feed(t) = (E(t + dt) - E(t)) / dt                            dt: to the next Stats line
 
-A Klipper of 2024 counts characters in sd_pos instead of bytes: it is off where a file is not ASCII.
+A Klipper of 2024 counts characters in sd_pos instead of bytes. It is wrong if a file is not ASCII.
 
-The fan is that of the last M106 or M107 so far, or of a macro whose text in the configuration has one. It is
-0 when Klipper starts, and after a print as the file left it. Between prints and in a pause the feed is 0.
+The fan is set by the last M106 or M107 so far, or by a macro whose text in the configuration contains one. It
+is 0 when Klipper starts. After a print it stays as the file left it. Between prints and in a pause the feed
+is 0.
 
-The printed file is the one beside the log whose lines end where the log's positions are; if several fit, the
-one that Moonraker's history or the log names.
+The printed file is in the log's folder or in its folder gcodes. It is the file with lines that end at the
+log's positions. If several fit, it is the one that Moonraker's history or the log names.
 
 Source: Klipper's virtual_sdcard.py, toolhead.py, gcode_move.py and fan.py.
 """
@@ -39,13 +40,14 @@ UNITS = {FAN: "percent", FEED: "mm/s"}
 NOT_RECORDED, LEFT_OUT = "printed_file", "gcode"
 SUFFIXES = (".gcode", ".g", ".gco")
 FOLDER = "gcodes"  # beside the log, as Moonraker calls it
-# G-code files that are looked at, bytes that are read of all of them, and the largest history
+# most G-code files that are searched, most bytes read from all of them together, and the largest history in
+# bytes
 MOST_FILES, MOST_BYTES, LARGEST_HISTORY = 1000, 1 << 29, 1 << 25
 BLOCK = 1 << 20  # a longer line is no command
-# positions of a print that are held against the ends of a file's lines, and the share that must agree
+# most positions of a print that are compared with the ends of a file's lines, and the share that must agree
 MOST_POSITIONS, AGREEING_SHARE = 2000, 0.99
 FEWEST_POSITIONS = 10  # so many positions tell a file without its name
-# a job of the history begins within so many s of its print
+# a job of the history begins within this many s of its print
 SAME_START_S = 10.0
 FILAMENT_TOLERANCE = 0.05
 LONGEST_MOVE_MM = 1e5  # a line that feeds more is damaged
@@ -67,8 +69,9 @@ _NO_MACRO = re.compile(
 
 
 class Print(NamedTuple):
-    """A print in the log: the position at which it starts, the one at which the file was over, -1 if it was
-    not, the file's name and size if the log gives them ("", -1), and the line at which it begins."""
+    """A print in the log: the position at which it starts; the position at which the file ended, -1 if it did
+    not end; the file's name and size, "" and -1 if the log does not give them; and the log line at which the
+    print begins."""
 
     start: int
     end: int
@@ -79,7 +82,7 @@ class Print(NamedTuple):
 
 class PrintRows(NamedTuple):
     """The Stats lines in the order of time, (n,) each: time and buffer_time in s, the position so far, the
-    index of its print, -1 for none, and whether the file is being read."""
+    index of its print (-1 for none), and whether the file is being read."""
 
     time_s: np.ndarray
     buffer_s: np.ndarray
@@ -89,7 +92,7 @@ class PrintRows(NamedTuple):
 
 
 class PrintedFile(NamedTuple):
-    """What the lines of a file give."""
+    """The content of a printed file."""
 
     filament_mm: np.ndarray  # (n,) fed by the lines before each position
     unscaled_mm: np.ndarray  # (n,) without M221, as Klipper counts filament_used
@@ -102,7 +105,7 @@ class PrintedFile(NamedTuple):
 
 
 class _Reading:
-    """The state of Klipper's gcode_move and part fan as the lines come in."""
+    """The state of Klipper's gcode_move and part fan while the lines are read."""
 
     def __init__(self, macros: Mapping[str, float]):
         self.macros = macros
@@ -126,7 +129,7 @@ class _Reading:
         self.unscaled += fed / self.factor
 
     def run(self, start: int, command: str, words: bytes) -> None:
-        """Any command but a move."""
+        """Runs any command except a move."""
         match command:
             case "G90" | "G91":
                 self.is_absolute_move = command == "G90"
@@ -177,15 +180,16 @@ def _word(letter: bytes, words: bytes) -> float | None:
 
 
 def fan_percent(words: bytes) -> float:
-    """What M106 requests with these words: S of 0 to 255, everything without an S."""
+    """Returns the fan speed in percent that M106 requests with these words: S from 0 to 255, full speed
+    without an S."""
     speed = _word(b"S", words)
     return min(max(100 * (255.0 if speed is None else speed) / 255, 0.0), 100.0)
 
 
 def read_file(path: Path, positions: np.ndarray, macros: Mapping[str, float]) -> PrintedFile:
-    """Filament at the positions (n,), ascending, and the fan's commands up to the last of them. `macros` are
-    those that set the part fan, in percent. G2 and G3 feed as G1 does; retractions and tools count as they
-    are."""
+    """Returns the filament at the positions (n,), ascending, and the fan's commands up to the last of them.
+    `macros`: those that set the part fan, in percent. G2 and G3 feed like G1. Retractions and tool changes
+    are counted as written."""
     state = _Reading(macros)
     filament, unscaled, k = np.zeros(len(positions)), np.zeros(len(positions)), 0
     wanted = [*positions.tolist(), np.inf]
@@ -213,13 +217,13 @@ def read_file(path: Path, positions: np.ndarray, macros: Mapping[str, float]) ->
 
 
 def _plain(command: bytes) -> str:
-    """ "G92" of "g092"."""
+    """Returns "G92" for "g092"."""
     return command[:1].decode().upper() + str(int(command[1:]))
 
 
 def _blocks(stream) -> Iterator[tuple[int, bytes]]:
-    """(offset, whole lines). Of a line that does not end within a block the rest becomes a comment; Klipper
-    does not run a last line without an end."""
+    """Yields (offset, whole lines). If a line does not end within a block, its rest becomes a comment. A last
+    line without an end is left out, because Klipper does not run it."""
     rest, offset = b"", 0
     while data := stream.read(BLOCK):
         block = rest + data
@@ -235,7 +239,8 @@ def _blocks(stream) -> Iterator[tuple[int, bytes]]:
 
 
 def companions(log: Path) -> list[Path]:
-    """The G-code files and histories beside a log and in its folder `gcodes`, in the order of names."""
+    """Returns the G-code files and histories in a log's folder and in its folder `gcodes`, in the order of
+    names."""
     places = itertools.chain(log.parent.glob("*"), (log.parent / FOLDER).rglob("*"))
     files = (path for path in places if path.suffix.lower() in SUFFIXES or is_history(path))
     try:
@@ -245,7 +250,7 @@ def companions(log: Path) -> list[Path]:
 
 
 def is_history(path: Path) -> bool:
-    """Whether a file is Moonraker's answer to /server/history/list, by its beginning."""
+    """Returns whether a file is Moonraker's answer to /server/history/list, judged by its beginning."""
     if path.suffix.lower() != ".json" or not path.is_file():
         return False
     try:
@@ -257,7 +262,7 @@ def is_history(path: Path) -> bool:
 
 
 def _jobs(path: Path) -> list[dict]:
-    """The jobs of a history that have a file and a start. Raises ValueError if it cannot be read."""
+    """Returns the jobs of a history that have a file and a start. Raises ValueError if it cannot be read."""
     if path.stat().st_size > LARGEST_HISTORY:
         raise ValueError(f"has more than {LARGEST_HISTORY >> 20} MB")
     document = orjson.loads(path.read_bytes())
@@ -273,7 +278,7 @@ def _jobs(path: Path) -> list[dict]:
 
 
 def _note(kind: str, count: int, message: str) -> Note:
-    """A note in one line of text, whatever bytes the names of files have."""
+    """Returns a note in one line of text, for any bytes in the names of files."""
     return Note(kind, "", count, " ".join(message.encode("utf-8", "backslashreplace").decode().split()))
 
 
@@ -282,7 +287,7 @@ def _is_number(value) -> bool:
 
 
 def _job_of(jobs: Sequence[dict], start_s: float) -> dict:
-    """The job that runs at the start of a print, {} if none does."""
+    """Returns the job that runs at the start of a print, {} if none does."""
     running = [
         job
         for job in jobs
@@ -293,8 +298,8 @@ def _job_of(jobs: Sequence[dict], start_s: float) -> dict:
 
 
 def misfit(path: Path, positions: np.ndarray, end: int, size: int = -1) -> str:
-    """Why a file is not the one in which Klipper stood at these positions and whose lines ended at `end`, ""
-    if it may be. `end` and `size` are -1 if the log does not give them."""
+    """Returns why a file cannot be the printed one, "" if it may be. In the printed file, Klipper stood at
+    these positions and the lines ended at `end`. `end` and `size` are -1 if the log does not give them."""
     own, last = path.stat().st_size, int(positions.max(initial=0))
     if size not in (-1, own) or own < last:
         return f"has {own} bytes"
@@ -312,14 +317,14 @@ def misfit(path: Path, positions: np.ndarray, end: int, size: int = -1) -> str:
 def _choose(
     candidates: Sequence[Path], name: str, positions: np.ndarray, of: Print
 ) -> tuple[Path | None, str]:
-    """(the file of a print, "") or (None, why there is none). `name` is what the history or the log calls it,
-    "" if none does."""
+    """Returns (the file of a print, "") or (None, why there is none). `name`: the file's name in the history
+    or the log, "" if neither has it."""
     misfits = {path: misfit(path, positions, of.end, of.size) for path in candidates}
     named = [path for path in candidates if path.name == Path(name).name]
     fitting = [path for path in candidates if not misfits[path]]
     if name and (len(positions) < FEWEST_POSITIONS or any(path in fitting for path in named)):
         fitting = [path for path in fitting if path in named]
-    # copies of one file are one
+    # copies of one file count once
     fitting = [p for i, p in enumerate(fitting) if not any(filecmp.cmp(p, q, False) for q in fitting[:i])]
     if len(fitting) == 1:
         return fitting[0], ""
@@ -340,8 +345,8 @@ def _choose(
 
 
 def _in_bytes(path: Path, positions: np.ndarray) -> np.ndarray:
-    """Positions (n,), ascending, that count characters, in bytes; as they are in a file of ASCII alone. The
-    first beyond the file's end and all after it are one byte beyond it."""
+    """Returns positions (n,), ascending, that count characters, as bytes; unchanged if the file is only
+    ASCII. The first one beyond the file's end and all after it are one byte beyond it."""
     found, characters, offset = [], 0, 0
     wanted = positions.astype(np.int64)
     with path.open("rb") as stream:
@@ -357,8 +362,8 @@ def _in_bytes(path: Path, positions: np.ndarray) -> np.ndarray:
 def _counted_in_characters(
     candidates: Sequence[Path], positions: np.ndarray, where: np.ndarray, prints: list[Print], i: int
 ) -> Path | None:
-    """The one file that fits print i at the rows `where` if its positions count characters. Positions and
-    print are then in bytes."""
+    """Returns the only file that fits print i at the rows `where` if its positions count characters, None if
+    there is no such file. Positions and print are then converted to bytes."""
     of, own = prints[i], np.unique(np.r_[prints[i].start, positions[where], max(prints[i].end, 0)])
     fitting = []
     for path in candidates:
@@ -376,7 +381,8 @@ def _counted_in_characters(
 
 
 class PrintSignals(NamedTuple):
-    """Part fan and feed (n,) by name, none if no print has its file; the files that they are from."""
+    """Part fan and feed (n,) by name, none if no print has its file; notes; and the files that they come
+    from."""
 
     values: dict[str, np.ndarray]
     notes: list[Note]
@@ -386,8 +392,8 @@ class PrintSignals(NamedTuple):
 def print_signals(
     log: Path, rows: PrintRows, prints: Sequence[Print], start_s: float, macros: Mapping[str, float]
 ) -> PrintSignals:
-    """Part fan and filament feed at the rows of a log; NaN in a print whose file is not known. `start_s` is
-    the time of day of the first row, NaN if it is not known."""
+    """Returns part fan and filament feed at the rows of a log; NaN in a print with an unknown file.
+    `start_s`: time of day of the first row, NaN if unknown."""
     notes: list[Note] = []
     rows, prints = rows._replace(position=rows.position.copy()), list(prints)
     indices = [int(i) for i in dict.fromkeys(rows.print_index.tolist()) if i >= 0]
@@ -416,8 +422,8 @@ def print_signals(
 
 
 def _files_of(log, rows: PrintRows, prints: list[Print], places, start_s: float, notes: list[Note]):
-    """({print: its file}, {print: its job}, the histories that were read); a note for each reason why a print
-    has no file. Positions that count characters are in bytes after it."""
+    """Returns ({print: its file}, {print: its job}, the histories that were read). Adds a note for each
+    reason why a print has no file. Positions that count characters are converted to bytes."""
     beside = companions(log)
     jobs, histories = [], []
     for path in (path for path in beside if path.suffix.lower() == ".json"):
@@ -450,7 +456,7 @@ def _files_of(log, rows: PrintRows, prints: list[Print], places, start_s: float,
 
 
 def _contents(files, rows: PrintRows, prints, places, macros, notes: list[Note]):
-    """{file: (positions, its content there)}, each file read once."""
+    """Returns {file: (positions, its content there)}. Each file is read once."""
     contents, budget = {}, MOST_BYTES
     for path in dict.fromkeys(files.values()):
         own = [i for i in files if files[i] == path]
@@ -471,7 +477,7 @@ def _contents(files, rows: PrintRows, prints, places, macros, notes: list[Note])
 
 
 def _on_rows(rows: PrintRows, prints, places, files, contents) -> tuple[np.ndarray, np.ndarray]:
-    """(feed, fan) at the rows (n,): the mean feed until the next row, the fan halfway to it."""
+    """Returns (feed, fan) at the rows (n,): the mean feed until the next row, the fan halfway to it."""
     count = len(rows.time_s)
     moved_s = np.maximum.accumulate(rows.time_s + rows.buffer_s)
     filament, unknown, total = np.zeros(count), np.zeros(count, bool), 0.0
@@ -507,8 +513,8 @@ def _event(time_s: float, percent: float) -> np.ndarray:
 
 
 def _fan_events(content: PrintedFile, start: int, positions, moved_s, before_s: float) -> np.ndarray:
-    """(time, percent) (m, 2) of the fan's commands in a print; a log that begins within the print takes the
-    last command before."""
+    """Returns (time, percent) (m, 2) of the fan's commands in a print. If the log begins within the print,
+    the last command before is included."""
     known = np.maximum.accumulate(np.r_[start, positions])
     at, percent = content.fan_positions, content.fan_percent
     inside = (at >= start) & (at < known[-1])
@@ -518,7 +524,7 @@ def _fan_events(content: PrintedFile, start: int, positions, moved_s, before_s: 
 
 
 def _filament_note(path: Path, printed_mm: float, used_mm) -> list[Note]:
-    """A note if the history has another length of filament than the file's lines."""
+    """Returns a note if the length of filament in the history differs from that of the file's lines."""
     if not _is_number(used_mm) or abs(printed_mm - used_mm) <= FILAMENT_TOLERANCE * max(used_mm, 1.0):
         return []
     message = (

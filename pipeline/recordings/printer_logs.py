@@ -1,4 +1,4 @@
-"""What print servers keep of a printer's temperatures: Moonraker's temperature store (JSON), and OctoPrint's
+"""Reads a printer's temperatures from print servers: Moonraker's temperature store (JSON), and OctoPrint's
 serial.log with the firmware's own reports."""
 
 import json
@@ -15,7 +15,7 @@ from pipeline.recordings.instants import instants, over_midnight
 # a temperature store holds twenty minutes, some 100 kB
 LARGEST_JSON = 1 << 25
 LONGEST_LINE = 1 << 14
-# how often the size of what was read is looked at
+# the size of the table is checked after every this many reports
 LINES_A_CHECK = 10_000
 # Moonraker's lists -> name, unit, factor; one entry a second
 _LISTS = {
@@ -37,9 +37,10 @@ _DEVICES = {"T": "tool", "B": "bed", "C": "chamber"}
 
 
 def load_moonraker(path: Path) -> WholeTable:
-    """The lists of server.temperature_store, one entry a second up to the newest; shorter lists begin later.
+    """Returns the lists of server.temperature_store, one entry a second up to the newest. Shorter lists begin
+    later.
 
-    Raises ValueError for a file that is no such store.
+    Raises ValueError if the file is not such a store.
     """
     if path.stat().st_size > LARGEST_JSON:
         raise ValueError(
@@ -80,7 +81,7 @@ def load_moonraker(path: Path) -> WholeTable:
 
 
 def _lists(store: dict):
-    """((device, key), entries) of each list of numbers."""
+    """Yields ((device, key), entries) of each list of numbers."""
     for device, lists in store.items():
         if isinstance(lists, dict) and isinstance(lists.get("temperatures"), list):
             yield from (((device, key), lists[key]) for key in _LISTS if isinstance(lists.get(key), list))
@@ -90,10 +91,10 @@ def _lists(store: dict):
 
 
 def load_serial_log(path: Path) -> WholeTable:
-    """Temperatures, targets and duties that the firmware reported: T, B and C in °C, @ in percent.
+    """Returns temperatures, targets and duties that the firmware reported: T, B and C in °C, @ in percent.
 
-    The duty counts to 127, or to 255 where it ever exceeds 127. Raises ValueError for a log without a report
-    that has a time.
+    The full duty is 127, or 255 if it ever exceeds 127. Raises ValueError if the log has no report with a
+    time.
     """
     rows = _Reports()
     with path.open("rb") as stream:
@@ -147,7 +148,7 @@ def _serial_table(rows: "_Reports", values: dict, lines: np.ndarray, ns: np.ndar
 
 
 class _Reports:
-    """Reports as they come in; a column that begins late is NaN before."""
+    """The reports while they are read. A column that begins late is NaN before."""
 
     def __init__(self) -> None:
         self.stamps: list[str] = []

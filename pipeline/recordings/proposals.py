@@ -35,16 +35,16 @@ from pipeline.recordings.signal_names import (
     split,
 )
 
-# levels and steps are looked up in so many values of a signal
+# levels and steps are searched in about this many values of a signal
 LOOKED_AT = 6000
 # records of commands without names have 0.88 to 1.0, measurements of a dryer, a furnace, an evaporator and a
 # kit 0.29 to 0.57
 TWO_LEVELS = 0.7
 FEWEST_ROWS = 20
-# a clock's interval is that of so many samples
+# a clock's interval is taken from at most this many samples
 CLOCK_SAMPLES = 100_000
 _STAMP = r"(^|\.)(sec|secs|seconds|nsec|nsecs|nanosec|nanos|seq|sequence)$|class$|(^|_)(id|num|index)$"
-# times and counts of a machine's own: an event counter, a time stamp in any unit
+# a machine's own times and counts: an event counter, a time stamp in any unit
 _COUNTER = (
     r"time.?stamp|(^|[._])(stamp|time|clock|uptime|millis|micros|ticks?|counter|epoch)(_?(s|ms|us|ns))?$"
 )
@@ -53,23 +53,24 @@ _STATUS = (
     r"interlock|warning|running|connected|valid|busy|homed|watchdog|heartbeat"
 )
 _SILENT = re.compile(rf"{_STAMP}|{_COUNTER}|{_STATUS}")
-# fields that say nothing: their topic's name does
+# field names that say nothing; the topic's name is used instead
 _BARE_FIELDS = ("data", "value", "val", "reading", "measurement", "float", "double")
 _COMMON_WORDS = {
     "temp", "temperature", "actual", "pwm", "duty", "power", "percent", "pct", "value", "data", "heater",
     "measured", "celsius", "degc", "deg", "c", "k", "f", "val", "sensor", "heat", "output", "cycle",
 }  # fmt: skip
 _TIMES = ("temps", "heure", "hora", "ora", "fecha")
-# an input of such a name can only warm; Klipper calls the hot end's heater "extruder"
+# an input with such a name can only heat; Klipper calls the hot end's heater "extruder"
 _HEATED = re.compile(r"\b(hot ?end|nozzle|barrel|bed)\b|^extruder.* pwm$")
 _TAKEN_NAMES = ("recording", "segment", "time_s")  # columns of the table of the record
 _TELLING = any_of(SET_POINT, TEMPERATURE, HEATER, DUTY, OUTPUT, PLACE, SPEED, MOVER, ACTUAL)
-# unit -> what makes °C of it
+# unit -> scale and offset to °C
 _CELSIUS = {"degC": (1.0, 0.0), "K": (1.0, -273.15), "degF": (0.555556, -17.7778)}
-# an owner's limit lies so far below that at which the firmware switches everything off
+# an owner's limit is this far below the temperature at which the firmware switches everything off
 BELOW_CUT_OFF_DEGC = 15.0
 MOST_DISTURBANCES = 16
-# a set-point rests in more than this share of its steps, and has few levels beside what is measured of it
+# a set-point is constant in more than this share of its steps, and has few levels compared with its measured
+# signal
 RESTING_SHARE, MORE_LEVELS = 0.95, 4
 
 
@@ -270,7 +271,8 @@ def _with_roles(signals: Sequence[RecordedSignal]) -> tuple[list[RecordedSignal]
     named = _with_commands_y([signal._replace(role=_role(signal)) for signal in signals])
     named = _without_hidden_set_points(named)
     roles = {signal.role for signal in named}
-    # a heater's volts are its command if nothing else is; the room's air is measured if nothing else is
+    # a heater's volts are its command if there is no other input; the room's temperature is an output if
+    # there is no other
     if "input" not in roles:
         named = [s._replace(role="input") if s.role == "electric" else s for s in named]
     if "output" not in roles:
@@ -377,7 +379,7 @@ def _role_of_name(name: Name, signal: RecordedSignal) -> str:
     # the output of a temperature's controller: TIC_1_Out, of 0 to 100
     in_percent = bool(low <= 0.0 and high <= 100.0)
     commands = says(OUTPUT, words) and (says_heater or says(COOLER, words) or in_percent)
-    # what neither a word nor a unit calls a temperature
+    # signals that neither a word nor a unit calls a temperature
     symbol = re.search(r"^[qu]( \d+)?$", words)
     measured = says(ACTUAL, words) or bool(re.search(r"\b(x|current)$", words))
     converted = low == 0 and bool((values == np.rint(values)).all())  # whole numbers that rest at 0
@@ -459,7 +461,7 @@ def _without_hidden_set_points(signals: Sequence[RecordedSignal]) -> list[Record
         if _rests(signal.values)
         for _, own, course in moving
         if numbers == own and len(course) > MORE_LEVELS * len(levels)
-        # the set-point lies within what is measured, a tenth of it wider
+        # the set-point lies within the measured range, extended by a tenth of it on both sides
         if course[0] - 0.1 * np.ptp(course) <= np.median(signal.values) <= course[-1] + 0.1 * np.ptp(course)
     }
     return [s._replace(role="set-point") if s.source in hidden else s for s in signals]
@@ -493,7 +495,7 @@ def _targets(signals: Sequence[RecordedSignal]) -> dict[str, RecordedSignal]:
         }
         equal = [source for source, (own, _) in outputs.items() if own == numbers]
         candidates = sorted(equal or outputs, key=lambda source: -likeness[source])
-        # without a word or a number in common only one candidate is no guess
+        # if nothing is in common, the choice is a guess unless there is only one candidate
         if not candidates or (len(candidates) > 1 and likeness[candidates[0]] == 0.0):
             continue
         best = candidates[0]

@@ -14,10 +14,10 @@ SPIKE_WINDOW = 7
 # times its neighbours' own changes
 SPIKE_SIGMAS, SPIKE_OVER_NEIGHBOURS = 8.0, 3.0
 SPIKE_LONGEST = 2
-# from so many values on, some of them are looked at before all
+# from this many values on, a part of them is checked first
 MANY_VALUES = 10_000
-# an input with no more levels than that between its limits follows a plan, and is not held back by the lower
-# one
+# an input with at most this many levels between its limits follows a plan, and its lower limit does not cut
+# it off
 PLANNED_LEVELS = 20
 # an extruder's barrel, nozzle and bed: a higher number in °C is doubtful; rooms in K and °F for a machine at
 # rest
@@ -119,7 +119,7 @@ def _spikes(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
     )
     spikes = []
     for group in _groups(np.flatnonzero(usable & (size > SPIKE_SIGMAS * sigma)), table.segment):
-        # beside a spike the median of a smooth signal is off by what it does in a sample
+        # beside a spike the median of a smooth signal is off by about one sample's change
         group = group[size[group] > size[group].max() / 2]
         if len(group) <= SPIKE_LONGEST and _stands_alone(table, name, group, size[group].min()):
             at, value = float(table.time_s[group[0]]), float(table.values[name][group[0]])
@@ -158,7 +158,7 @@ def quantisation_step(values: np.ndarray) -> float:
     distances are whole multiples of d (to a tenth: rounded print-outs of 0.0322 differ by 0.032 or 0.033).
     And values come back to their levels, at least three times each on average.
     """
-    # a signal with all its digits shows in little more than a third of its values that it has too many levels
+    # a little more than a third of the values is enough to see that an unquantised signal has too many levels
     some = values[: 2 * len(values) // 5] if len(values) >= MANY_VALUES else values
     levels = np.unique(some)
     if len(some) < len(values) and len(levels) <= len(values) / 3:
@@ -166,7 +166,7 @@ def quantisation_step(values: np.ndarray) -> float:
     if len(levels) < 2 or len(levels) > len(values) / 3:
         return 0.0
     distances = np.diff(levels)
-    # levels that differ by rounding alone are one
+    # levels that differ only by rounding are one
     distances = distances[distances > 1e-9 * max(1.0, float(np.abs(levels).max()))]
     if not len(distances):
         return 0.0
@@ -212,9 +212,10 @@ def _at_limits(table: Table, name: str, low: float, high: float) -> list[Flag]:
     values, usable, flags = table.values[name], ~table.masked[name], []
     tolerance = 1e-6 * (high - low)
     inside = values[usable & (values > low + tolerance) & (values < high - tolerance)]
-    # a few values tell already that there are more
+    # a part of the values is often enough to see that there are more levels
     planned = all(len(np.unique(some)) <= PLANNED_LEVELS for some in (inside[:MANY_VALUES], inside))
-    # a controller or a random signal moves in most samples and is cut off; a plan of levels asks for it
+    # a controller or a random signal changes in most samples and is cut off; a plan of levels wants the limit
+    # itself
     cut_off = not planned and np.mean(np.diff(inside) != 0) > 0.5
     remark = ": there the limit decides, not what commands it" if cut_off else ""
     for limit, at in ((low, np.abs(values - low) <= tolerance), (high, np.abs(values - high) <= tolerance)):
@@ -329,7 +330,7 @@ def _percent_doubts(values: np.ndarray, limit: float) -> list[tuple[object, str]
 # was stopped by its sensor
 
 FROZEN_SHORTEST, RAIL_SHORTEST, OVER_USUAL = 30, 10, 5.0
-# samples beside a stretch in which the signal must have been alive
+# samples before and after a stretch that are checked for noise or movement
 BESIDE = 24
 
 
@@ -427,7 +428,7 @@ def _usual_of_others(lengths: np.ndarray, own: np.ndarray) -> np.ndarray:
     at = np.searchsorted(ordered, own)  # where the stretch itself stands
     wanted = np.ceil(0.9 * (total[-1] - own)).astype(int)
     j = np.searchsorted(total, wanted)
-    # behind itself the others hold less by its length
+    # at and after the stretch itself, the sum over the others is smaller by its length
     later = np.maximum(np.searchsorted(total, wanted + own), at + 1)
     return ordered[np.where(j < at, j, later)].astype(float)
 
@@ -453,9 +454,9 @@ def least_change(values: np.ndarray, lag: int = 1) -> float:
 
 
 def _alive(changes: np.ndarray, step: float) -> str:
-    """Returns what the signal did before it stopped: "noise" larger than its step, "movement" in one
-    direction that does not slow down, "" for neither (it rests, or comes to rest), "edge" if the record has
-    too few samples there."""
+    """Returns what the signal did before it stopped. "noise": changes larger than its step; "movement": in
+    one direction without slowing down; "": neither (it rests, or comes to rest); "edge": the record has too
+    few samples there."""
     changes = changes[np.isfinite(changes)]
     if len(changes) < BESIDE // 2:
         return "edge"
@@ -493,12 +494,12 @@ def _at_rail(values: np.ndarray, segment: np.ndarray, first: np.ndarray) -> np.n
 
 # ---- two devices under one name: samples jump to and fro between two courses, and intervals alternate
 
-# windows of so many samples, half overlapping: short ones for devices that write in turn, long ones for
+# windows of this many samples, half overlapping: short ones for devices that write alternately, long ones for
 # devices that write in batches
 WINDOWS = (32, 128)
 LEAST_SHARE, LEAST_CROSSINGS, LEAST_WINDOWS = 1 / 8, 4, 3
-# between the two courses lies nothing: a gap three times any other, and three steps of a coarse sensor, of
-# which none is coarser than 2
+# no sample lies between the two courses: the gap is more than three times any other, and more than three
+# steps of a coarse sensor. No sensor is assumed to be coarser than 2
 GAP, COARSEST_STEP = 3.0, 2.0
 WINDOWS_AT_ONCE = 1000
 
@@ -542,7 +543,7 @@ def find_mixed(values: np.ndarray) -> list[tuple[int, int, float]]:
         hit = _in_a_row(gap > 0, min(LEAST_WINDOWS, len(gap)))
         if not hit.any():
             continue
-        # most records are through by now: the step costs more than the gaps
+        # most records are finished here; the step costs more time than the gaps
         step = step or _coarse_step(y)
         hit = _in_a_row(gap > GAP * step, min(LEAST_WINDOWS, len(gap)))
         for start, width in zip(starts[hit], gap[hit], strict=True):
@@ -557,9 +558,11 @@ def find_mixed(values: np.ndarray) -> list[tuple[int, int, float]]:
 
 def _coarse_step(y: np.ndarray) -> float:
     """Returns the step that a coarse sensor may explain, more than 0."""
-    # over one sample and over more: with two devices in turn every change from sample to sample is a jump
+    # over one sample and over more, because with two alternating devices every change between samples is a
+    # jump
     step = min(COARSEST_STEP, *(least_change(y, lag) for lag in (1, 2, 3)))
-    # a converter may be coarser: its levels tell, where there are more than the two of two devices at rest
+    # a converter may be coarser. Its levels show this if there are more than two (two devices at rest have
+    # two)
     return max(step, quantisation_step(y)) if len(np.unique(y)) > 2 else step
 
 

@@ -1,9 +1,10 @@
-"""A folder of recordings -> the table of each: which files are read, which were read before and which are
-broken.
+"""Reads a folder of recordings into a table for each, and decides which files are read, which were read
+before and which are broken.
 
 The memo is content-addressed. The hash of the recording, of the wish and of the code that reads names the
-entry, so that one more recording costs one reading. An entry counts if its files have the digests that were
-written last; otherwise the recording is read again."""
+entry, so a new recording costs only its own reading. An entry is used if its files have the digests that were
+written last; otherwise the recording is read again.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -29,14 +30,14 @@ _GROWING = "is still being written; wait until its copy is complete and run it a
 # notes of rows that a reader left out
 _LEFT_OUT = ("truncated", "trailing", "damage")
 CODE = Path(__file__).parents[1]
-# what decides what an entry of the memo holds: changed code reads everything again
+# the code that decides the content of a memo entry; if it changes, everything is read again
 READING = ("store/artifacts.py", "store/params.py", "store/tables.py", "recordings/*.py")
 
 
 class RecordingWish(NamedTuple):
-    """What to take from every recording: the sources of all signals, which of them are inputs and within
-    which limits, the sample time, the clock, the gap limit, the decimal mark of text ("": found), and the
-    schemas of the record, of the set-points beside it (None: not recorded) and of its findings."""
+    """What to read from every recording: the sources of all signals; {input: limits}; the sample time; the
+    clock; the gap limit; the decimal mark of text ("": find it); and the schemas of the record, of its
+    findings, and of the recorded set-points (None: not recorded)."""
 
     sources: tuple[Source, ...]
     limits: dict[str, tuple[float, float]]
@@ -51,14 +52,14 @@ class RecordingWish(NamedTuple):
 
     @property
     def whole(self) -> Schema:
-        """Record and set-points in one table."""
+        """The schema of record and set-points in one table."""
         beside = self.set_points.columns if self.set_points else ()
         return self.record._replace(columns=(*self.record.columns, *beside))
 
 
 class RecordingTable(NamedTuple):
-    """One recording's share of the record and of its findings; `reason` is why it was quarantined, "" if it
-    was not."""
+    """One recording's share of the record and of its findings. `reason`: why it was quarantined or passed
+    over, otherwise ""."""
 
     name: str
     record: dict[str, np.ndarray]
@@ -78,10 +79,10 @@ def read_folder(
     ignored: Collection[str] = (),
     waits: bool = False,
 ) -> list[RecordingTable]:
-    """Every recording below `folder` but files named `ignored`, in the order of names, on as many workers as
-    `execution` says. A recording that needs more than its budget is quarantined.
+    """Returns every recording below `folder`, except files named `ignored`, in the order of names. As many
+    workers as `execution` says read them. A recording that needs more than its budget is quarantined.
 
-    Copies that are not complete, by their names, are passed over. If `waits`, a file that changed a moment
+    Incomplete copies, recognised by their names, are passed over. If `waits`, a file that changed a moment
     ago is waited for, ten seconds at most, and passed over if it changes meanwhile. Raises ValueError if
     there is no recording.
     """
@@ -124,7 +125,7 @@ def read_folder(
 
 
 def _growing(files: Sequence[Path]) -> list[Path]:
-    """The recordings that change, or whose printed files do."""
+    """Returns the recordings that are changing, or whose printed files are."""
     beside = {path: printed_gcode.companions(path) if _is_klippy(path) else [] for path in files}
     watched = dict.fromkeys([*files, *(other for others in beside.values() for other in others)])
     changing = set(plain_files.wait_until_still(list(watched)))
@@ -132,8 +133,8 @@ def _growing(files: Sequence[Path]) -> list[Path]:
 
 
 def _printed_beside(files: Sequence[Path]) -> dict[Path, list[tuple[str, str]]]:
-    """(name, hash) of each G-code file and history beside a klippy.log, which its fan and feed are from; none
-    for another recording."""
+    """Returns (name, hash) of each G-code file and history beside a klippy.log, because its fan and feed come
+    from them; none for other recordings."""
     beside: dict[Path, list[tuple[str, str]]] = {}
     for path in files:
         if path.parent not in beside and _is_klippy(path):
@@ -152,7 +153,7 @@ def _is_klippy(path: Path) -> bool:
 def _recordings_below(
     folder: Path, ignored: Collection[str], *, waits: bool
 ) -> tuple[list[Path], dict[Path, str]]:
-    """The recordings below a folder, and {path: reason} of copies that are not complete."""
+    """Returns the recordings below a folder, and {path: reason} of incomplete copies."""
     plain_files.check_plain_files(folder)
     bags = {path.parent for path in folder.rglob("metadata.yaml") if is_bag(path.parent)} - {folder}
     files = sorted(
@@ -175,8 +176,8 @@ def _recordings_below(
 
 
 def _copies(files: Sequence[Path], hashes: Sequence[str]) -> dict[Path, str]:
-    """Why a file is left out that is a copy of another: what is learned from twice is
-    trusted twice, and judged by what it was learned from."""
+    """Returns why a file is left out that is a copy of another. A copy would count twice in learning, and
+    could be tested with data that was learned from."""
     first: dict[str, Path] = {}
     return {
         path: " ".join(
@@ -188,7 +189,7 @@ def _copies(files: Sequence[Path], hashes: Sequence[str]) -> dict[Path, str]:
 
 
 def _without_text(files: Sequence[Path]) -> dict[Path, str]:
-    """Why a file is left out whose name is no text: no table can hold it."""
+    """Returns why a file is left out whose name is not text, so that no table can hold it."""
     return {
         path: f"{_utf8(str(path))}: its name should be UTF-8 but has other bytes; rename the file"
         for path in files
@@ -197,7 +198,7 @@ def _without_text(files: Sequence[Path]) -> dict[Path, str]:
 
 
 def _utf8(name: str) -> str:
-    """The name with its bytes that are no UTF-8 written out."""
+    """Returns the name, with its bytes that are not UTF-8 written out."""
     return name.encode("utf-8", "backslashreplace").decode()
 
 
@@ -208,8 +209,8 @@ def _run(
     execution: Execution,
     where: tuple[Path, Budget],
 ) -> list[str]:
-    """The reasons of `_within`, in the order of `todo`; workers of a cluster see the same file
-    system under absolute paths. On one machine threads wait for children that do the work."""
+    """Returns the reasons from `_within`, in the order of `todo`. Workers of a cluster see the same file
+    system under absolute paths. On one machine, threads wait for child processes that do the work."""
     memo, budget = where
     calls = [
         joblib.delayed(_within)(budget, path.resolve(), path, folder, key, wish, memo.resolve())
@@ -221,7 +222,8 @@ def _run(
 
 
 def _within(budget: Budget, path: Path, shown: Path, *arguments) -> str:
-    """The reason of `_one`, which works in a child; also where it needs more than the budget."""
+    """Returns the reason from `_one`, which runs in a child process, or the reason that it needs more than
+    the budget."""
     try:
         return isolated(_one, path, shown, *arguments, shown=shown, budget=budget)
     except ValueError as reason:
@@ -229,8 +231,8 @@ def _within(budget: Budget, path: Path, shown: Path, *arguments) -> str:
 
 
 def _one(path: Path, shown: Path, folder: Path, key: str, wish: RecordingWish, memo: Path) -> str:
-    """Read, resample and flag one recording into the memo, under the path that is
-    `shown`; the reason why it cannot be, or an empty text."""
+    """Reads, resamples and flags one recording and writes it to the memo, under the path `shown`. Returns the
+    reason why it cannot be read, or an empty text."""
     name = shown.relative_to(folder).as_posix()
     beside = [column.name for column in wish.set_points.columns] if wish.set_points else []
     units = {source.signal: source.unit for source in wish.sources if source.signal not in beside}
@@ -253,7 +255,7 @@ def _one(path: Path, shown: Path, folder: Path, key: str, wish: RecordingWish, m
             if flagged.kind == "mixed" and table.masked[flagged.signal].mean() > 0.5:
                 raise ValueError(f"{path}: {flagged.message}")
     except ValueError as reason:
-        # on a cluster the path is absolute; what is said is the same wherever the work is done
+        # on a cluster the path is absolute; the message must be the same wherever the work is done
         return " ".join(str(reason).split()).replace(str(path), str(shown))
     findings = [(f.kind, f.signal, f.start_s, f.end_s, f.count, f.message) for f in table.flags]
     findings += [
@@ -281,7 +283,7 @@ def _one(path: Path, shown: Path, folder: Path, key: str, wish: RecordingWish, m
 
 
 def _cut_rows(raw: Raw) -> list[Flag]:
-    """A flag for a recording whose reader left out many rows. (MCAP's damage is counted in chunks.)"""
+    """Returns a flag if the recording's reader left out many rows. (Damage in MCAP is counted in chunks.)"""
     if file_format(Path(raw.path)) in ("mcap", "bag"):
         return []
     left_out = sum(note.count for note in raw.notes if note.kind in _LEFT_OUT)
@@ -298,8 +300,8 @@ def _digests(memo: Path, key: str) -> dict[str, str]:
 def _remembered(
     memo: Path, key: str, wish: RecordingWish
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]] | None:
-    """Record and quality of an entry whose digests, written last, are those of its files;
-    None if it is absent, half written or damaged."""
+    """Returns record and quality of an entry with files that have the digests written last; None if it is
+    absent, incomplete or damaged."""
     try:
         if artifacts.read_json(memo / f"{key}.json") != _digests(memo, key):
             return None
@@ -331,8 +333,8 @@ def _result(name: str, entry: tuple[dict, dict] | None, reason: str, reused: boo
 def join(
     results: Sequence[RecordingTable], wish: RecordingWish, *, strict: bool
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict]:
-    """The columns of one record and of one table of findings, in the order of names, and figures. Raises
-    ValueError if no recording is left, or if `strict` and one is broken."""
+    """Returns the columns of one record and of one table of findings, in the order of names, and figures.
+    Raises ValueError if no recording is left, or if `strict` and one is broken."""
     passed = [result for result in results if result.passed_over]
     results = [result for result in results if not result.passed_over]
     broken = [result for result in results if result.reason]
@@ -378,7 +380,7 @@ def join(
 def with_finding(
     quality: Mapping[str, np.ndarray], signal: str, kind: str, message: str, *, recording: str = ""
 ) -> dict[str, np.ndarray]:
-    """The columns of findings with one more row, which has no place in time."""
+    """Returns the columns of findings with one more row, which has no place in time."""
     row = {
         "recording": recording,
         "signal": signal,
@@ -392,7 +394,8 @@ def with_finding(
 
 
 def count_work(results: Sequence[RecordingTable]) -> dict[str, int]:
-    """How many recordings were processed and how many the memo gave: of this run alone, so no metric."""
+    """Returns how many recordings were processed and how many came from the memo. This concerns one run only,
+    so it is not a metric."""
     return {
         "processed": sum(not r.reused and not r.reason for r in results),
         "reused": sum(r.reused for r in results),
@@ -402,8 +405,8 @@ def count_work(results: Sequence[RecordingTable]) -> dict[str, int]:
 def printer_pids(
     folder: Path, results: Sequence[RecordingTable], sources: Sequence[Source], inputs: Collection[str]
 ) -> dict[str, list[dict]]:
-    """{"heaters": [...]}: the PIDs by which a printer held the heaters whose duty and temperature are signals
-    of ours, in our units; {} if no good recording is a klippy.log. The last log's values count."""
+    """Returns {"heaters": [...]}: in our units, the printer's own PIDs of heaters with duty and temperature
+    among our signals; {} if no good recording is a klippy.log. The last log's values are used."""
     of = {source.source: source for source in sources}
     pids: dict[str, dict] = {}
     logs = [r.name for r in results if not r.reason and file_format(folder / r.name) == "klippy.log"]

@@ -1,5 +1,5 @@
-"""Recordings of other people's machines -> signals on their own clocks: MCAP and bags, Parquet, CSV, logs of
-printers, spreadsheets, MATLAB files. Damaged, missing and left-out samples are counted.
+"""Reads recordings of other people's machines as signals on their own clocks: MCAP and bags, Parquet, CSV,
+logs of printers, spreadsheets, MATLAB files. Damaged, missing and left-out samples are counted.
 
 `read` is the entry point. `resample` and `flag` make a table of its result; `inspect` describes a file in
 words.
@@ -54,24 +54,24 @@ __all__ = [
 
 
 FAHRENHEIT = {"degf", "°f", "° f", "℉", "f", "fahrenheit"}
-# at the end of a column's name; an F without brackets is as well the sixth zone
+# at the end of a column's name; an F without brackets could also be the sixth zone
 _NAMES_FAHRENHEIT = re.compile(r"(?:[\[(]F[\])]|(?:[\[(_ ](?:deg[Ff]|[Ff]ahrenheit)|°\s?F|℉)[\])]?)$")
 
 
 def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal: str = "") -> Raw:
-    """The signals of a recording, each on its own clock, in our units.
+    """Returns the signals of a recording, each on its own clock, in our units.
 
-    `time` names the clock. In a table it is a column (by default one with a name of a time) or, without one,
-    "every 0.5 s". In MCAP it is log_time (the default), publish_time, or a field of every topic such as
-    header.stamp. A clock of the calendar is counted from the first whole second of the record. Missing
+    `time` names the clock. In a table it is a column (by default one with a name of a time) or, if there is
+    none, "every 0.5 s". In MCAP it is log_time (the default), publish_time, or a field of every topic such as
+    header.stamp. If the clock is a calendar's, time counts from the first whole second of the record. Missing
     numbers are NaN, and counted in a note. `decimal` is the decimal mark of a text file, "" to find it.
 
-    Of a clock that does not run forward, what can be put right without a guess is, and is counted in notes:
-    see `clocks.repair`.
+    A clock that does not run forward is repaired if no guess is needed. Repairs are counted in notes: see
+    `clocks.repair`.
 
-    Raises ValueError, one sentence with file, place, expected, found and remedy, for a source that is not
-    there, text in place of a number, a signal without any number, a time that is missing, repeated or runs
-    backwards, and a file that cannot be read.
+    Raises ValueError, one sentence with file, place, expected, found and remedy, if a source does not exist,
+    a number is text, a signal has no number at all, a time is missing, repeated or runs backwards, or a file
+    cannot be read.
     """
     path = Path(path)
     _check_sources(path, sources)
@@ -110,8 +110,8 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal
 def _file_columns(
     path: Path, kind: str, names: Sequence[str], time: str, decimal: str
 ) -> tuple[list[FileColumns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
-    """Columns on their clocks, {source: (name of its columns, name in them)}, {name: count of messages or
-    rows} and notes of a file of that kind."""
+    """Returns columns on their clocks, {source: (name of its columns, name in them)}, {name: number of
+    messages or rows} and notes of a file of that kind."""
     if kind == "mcap":
         with path.open("rb") as stream:
             check_magic(path, stream.read(16))
@@ -133,7 +133,8 @@ def _file_columns(
 
 
 def _check_printed(path: Path, table: WholeTable, names: Sequence[str]) -> None:
-    """Raises ValueError with the file that is missing if the fan or the feed is wanted without it."""
+    """Raises ValueError with the missing file if the fan or the feed is wanted but cannot be computed without
+    it."""
     reason = next((note.message for note in table.notes if note.kind == NOT_RECORDED), "")
     if reason and any(name in UNITS and name not in table.values for name in names):
         raise ValueError(f"{path}: {reason}")
@@ -158,7 +159,7 @@ def _check_sources(path: Path, sources: Sequence[Source]) -> None:
 
 
 def _clocks(columns: Sequence[FileColumns], notes: list[Note]) -> dict[str, np.ndarray]:
-    """{topic: time_s (n,)}, all counted from one instant."""
+    """Returns {topic: time_s (n,)}, all counted from one instant."""
     first = min(group.time[0] for group in columns)
     on_calendar = columns[0].time.dtype == np.int64
     unit = 10**9 if on_calendar else 1.0
@@ -174,9 +175,9 @@ def _clocks(columns: Sequence[FileColumns], notes: list[Note]) -> dict[str, np.n
 def _signal(
     path: Path, source: Source, time: np.ndarray, group: FileColumns, recorded: np.ndarray, notes: list[Note]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Time and values in the signal's unit. A signal that has a value in less than half of the rows, spread
-    among them, has its own clock: those rows. Raises ValueError for a column without any number, and for one
-    in °F, as its unit or its name says, that the mapping takes as °C."""
+    """Returns time and values in the signal's unit. A signal with a value in less than half of the rows,
+    spread among them, has its own clock: those rows. Raises ValueError if a column has no number at all, or
+    if its unit or name says °F but the mapping uses it as °C."""
     written = group.units.get(source.source, "").strip(" ()[]").casefold()
     is_fahrenheit = written in FAHRENHEIT if written else bool(_NAMES_FAHRENHEIT.search(source.source))
     is_converted = abs(source.scale * 9 / 5 - 1) < 0.01

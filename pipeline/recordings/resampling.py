@@ -1,5 +1,5 @@
-"""Signals on their own clocks -> one table on one sample time. Inputs are held, outputs interpolated between
-near neighbours; a gap begins a new segment."""
+"""Resamples signals on their own clocks to one table with one sample time. Inputs are held, outputs are
+interpolated between near neighbours. A new segment begins after a gap."""
 
 from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, TypeVar
@@ -9,21 +9,21 @@ import numpy as np
 from pipeline.recordings.formats import Flag, Jitter, Raw, Table
 from pipeline.recordings.quality import alternate, mask_mixed
 
-# a sample within that share of the sample time from the grid is on it: a temperature's change in a hundredth
-# of a sample is far below any sensor's step
+# a sample within this share of the sample time from the grid counts as on it, because a temperature changes
+# in a hundredth of a sample by far less than any sensor's step
 ON_GRID = 0.01
 GAP_INTERVALS = 3.0
-# commands are sent periodically if nearly all of their intervals are alike; else they are events, and a long
-# silence is no gap
+# commands are periodic if nearly all of their intervals are alike. Otherwise they are events, and a long
+# pause is no gap
 PERIODIC_SHARE = 0.95
 JITTER_SHARE, JITTER_OFTEN = 0.1, 0.01
-# a recording of which more than that was left out is a finding, % of its rows or samples
+# a recording is flagged if more than this was left out, % of its rows or samples
 MOST_CUT_PERCENT = 5.0
 
 
 class _Clock(NamedTuple):
-    """One clock and the signals on it. A gap is an interval beyond `gap_limit_s` (infinite for commands that
-    come as events)."""
+    """One clock and the signals on it. A gap is an interval longer than `gap_limit_s` (infinite for commands
+    that come as events)."""
 
     time_s: np.ndarray
     signals: list[str]
@@ -31,11 +31,11 @@ class _Clock(NamedTuple):
     jitter: Jitter | None
 
 
-# the samples of a clock beside each t_k: the indices of the first behind it and of the nearest, and how far
-# that is, each (T,); and the k without a sample on t_k
+# the samples of a clock beside each t_k: the indices of the next sample and of the nearest one, and the
+# distance of the nearest, each (T,); and the k without a sample on t_k
 _Neighbours = tuple[np.ndarray, np.ndarray | slice, np.ndarray, np.ndarray]
 # the t_k from which a command of a clock acts, for each of its n samples: k, how late that is, and whether it
-# counts, as one between two samples of a segment does
+# counts (a command between two samples of a segment does)
 _Effect = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -48,18 +48,18 @@ def resample(
     max_gap_s: float | None = None,
     averaged: Collection[str] = (),
 ) -> Table:
-    """The table of a recording on the grid t_k = t_0 + k T of each segment.
+    """Returns the table of a recording on the grid t_k = t_0 + k T of each segment.
 
     Inputs: u_k is the last command at or before t_k. Outputs: y_k is the sample at t_k if there is one
-    (within T / 100: the record's own numbers, unaltered), else the straight line between its neighbours.
+    (within T / 100: the record's own number, unaltered), otherwise the straight line between its neighbours.
     Inputs that are `averaged`: u_k is the mean of the held commands from t_k to t_k + T, so that a flow that
     changes faster keeps its volume.
 
     A gap is an interval longer than `max_gap_s` (default: three sample times or three median intervals,
     whichever is longer) on any clock. Nothing is interpolated or held across a gap, and a new segment begins
-    behind it. Segments span the time that all clocks have in common. A value whose neighbours are missing is
+    after it. Segments cover only the time that all clocks have in common. A value with missing neighbours is
     NaN and masked. Flags report gap, jitter, interpolated, filled, step_inside, step_lost, missing, mixed,
-    trimmed, short and rate.
+    trimmed, cut, short and rate.
 
     Raises ValueError if a signal is not in the recording, if the clocks have no time in common, or if no
     segment has two samples.
@@ -102,7 +102,7 @@ def resample(
 
 
 def hold(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray) -> np.ndarray:
-    """The last of the values (n,) at or before each instant (T,); NaN before the first."""
+    """Returns the last of the values (n,) at or before each instant (T,); NaN before the first."""
     rows = np.searchsorted(time_s, at_s, side="right")
     return np.r_[np.nan, values][rows]
 
@@ -166,7 +166,7 @@ def _clocks(
 
 
 def intervals(time_s: np.ndarray, gap_limit_s: float = np.inf) -> Jitter:
-    """Jitter of a clock time_s (n,), n >= 2, from the intervals up to `gap_limit_s`."""
+    """Returns the jitter of a clock time_s (n,), n >= 2, from the intervals up to `gap_limit_s`."""
     steps = np.diff(time_s)
     inside, median = steps <= gap_limit_s, np.median(steps)
     if inside.all() or not inside.any():
@@ -182,7 +182,8 @@ _Result = TypeVar("_Result")
 def _once_a_clock(
     clocks: Sequence[_Clock], names: Sequence[str], calculate: Callable[[np.ndarray], _Result]
 ) -> dict[str, _Result]:
-    """{signal: calculate(its time_s)} for the named signals; those on one clock share it."""
+    """Returns {signal: calculate(its time_s)} for the named signals. Signals on one clock share the
+    result."""
     results: dict[str, _Result] = {}
     for clock in clocks:
         if signals := [name for name in clock.signals if name in names]:
@@ -191,7 +192,8 @@ def _once_a_clock(
 
 
 def _pieces(raw: Raw, clocks: Sequence[_Clock], sample_time_s: float) -> list[tuple[float, float]]:
-    """Stretches (start, end) in which every clock runs without a gap, and none had started over."""
+    """Returns the stretches (start, end) in which every clock runs without a gap and without starting over.
+    Raises ValueError if there are none."""
     pieces, breaks = [(-np.inf, np.inf)], np.array(raw.breaks)
     for clock in clocks:
         restarts = np.searchsorted(breaks, clock.time_s, side="right")
@@ -199,7 +201,7 @@ def _pieces(raw: Raw, clocks: Sequence[_Clock], sample_time_s: float) -> list[tu
         last = np.r_[cuts, len(clock.time_s) - 1]
         starts, ends = clock.time_s[np.r_[0, cuts + 1]], clock.time_s[last].astype(float)
         if np.isinf(clock.gap_limit_s):
-            # the last event holds on, up to where the clock starts over
+            # the last event remains in effect until the clock starts over
             ends = np.nextafter(np.r_[breaks, np.inf], -np.inf)[restarts[last]]
         stretches = list(zip(starts.tolist(), ends.tolist(), strict=True))
         pieces = _common(pieces, stretches, sample_time_s * ON_GRID)
@@ -218,7 +220,7 @@ def _pieces(raw: Raw, clocks: Sequence[_Clock], sample_time_s: float) -> list[tu
 def _common(
     first: Sequence[tuple[float, float]], second: Sequence[tuple[float, float]], tolerance: float
 ) -> list[tuple[float, float]]:
-    """Intersections of two sorted lists of intervals."""
+    """Returns the intersections of two sorted lists of intervals."""
     common, i, j = [], 0, 0
     while i < len(first) and j < len(second):
         start, end = max(first[i][0], second[j][0]), min(first[i][1], second[j][1])
@@ -235,21 +237,22 @@ def _common(
 
 
 def _in_one(indices: np.ndarray) -> np.ndarray | slice:
-    """Indices that run on one by one as a slice, which copies nothing."""
+    """Returns consecutive indices as a slice, which copies nothing; other indices unchanged."""
     first = int(indices[0])
     end = first + len(indices)
     return slice(first, end) if np.array_equal(indices, np.arange(first, end)) else indices
 
 
 def _last_command(time_s: np.ndarray, grid: np.ndarray, sample_time_s: float) -> np.ndarray | slice:
-    """The index of the last command at or before t_k. There is one, as pieces begin at or behind the first
-    command."""
+    """Returns the index of the last command at or before t_k. It always exists, because no piece begins
+    before the first command."""
     last = np.searchsorted(time_s, grid + ON_GRID * sample_time_s, side="right") - 1
     return _in_one(np.maximum(last, 0))
 
 
 def _means(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, sample_time_s: float) -> np.ndarray:
-    """(F(t_k + T) - F(t_k)) / T, F the integral of the held commands; NaN if one of them is missing."""
+    """Returns (F(t_k + T) - F(t_k)) / T, F the integral of the held commands; NaN if one of them is
+    missing."""
     ends = np.r_[time_s, max(time_s[-1], grid[-1]) + sample_time_s]
     missing = ~np.isfinite(values)
     areas = [np.r_[0.0, np.cumsum(v * np.diff(ends))] for v in (np.where(missing, 0.0, values), missing)]
@@ -271,7 +274,8 @@ def _neighbours(time_s: np.ndarray, grid: np.ndarray, sample_time_s: float) -> _
 def _interpolate(
     time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, neighbours: _Neighbours
 ) -> np.ndarray:
-    """y(t_k): the sample on t_k itself, else the line between its neighbours. A NaN neighbour gives NaN."""
+    """Returns y(t_k): the sample at t_k itself, otherwise the straight line between its neighbours. A NaN
+    neighbour gives NaN."""
     later, nearest, _, off = neighbours
     y = values[nearest].astype(float, copy=False)
     if len(off):
@@ -284,7 +288,8 @@ def _interpolate(
 def _effect(
     time_s: np.ndarray, grid: np.ndarray, segment: np.ndarray, sample_time_s: float
 ) -> _Effect | None:
-    """None if each sample stands on a t_k of its own, so that no command is late or lost."""
+    """Returns when each command takes effect; None if each sample has a t_k of its own, so that no command is
+    late or lost."""
     k = np.searchsorted(grid, time_s - ON_GRID * sample_time_s)
     within = np.clip(k, 1, len(grid) - 1)
     late, counts = grid[within] - time_s, (k == within) & (segment[within] == segment[within - 1])
@@ -321,8 +326,8 @@ def _gap_flags(clocks: Sequence[_Clock]) -> list[Flag]:
 
 
 def _jitter_flags(clocks: Sequence[_Clock]) -> list[Flag]:
-    """A flag for each clock with one interval in a hundred off by a tenth, or with any off by a half.
-    Commands that come as events have no interval."""
+    """Returns a flag for each clock with at least one interval in a hundred off by more than a tenth, or with
+    any off by more than a half. Commands that come as events have no interval."""
     flags = []
     for clock in clocks:
         jitter = clock.jitter
@@ -376,7 +381,7 @@ def _trim_flags(
 
 
 def cut_flags(left_out: int, count: int, what: str, start_s: float, end_s: float) -> list[Flag]:
-    """A flag for a recording of which more than MOST_CUT_PERCENT was left out."""
+    """Returns a flag if more than MOST_CUT_PERCENT of a recording was left out."""
     percent = 100 * left_out / max(count, 1)
     if percent <= MOST_CUT_PERCENT:
         return []
@@ -390,8 +395,8 @@ def cut_flags(left_out: int, count: int, what: str, start_s: float, end_s: float
 def _fill_flags(
     name: str, neighbours: _Neighbours, grid: np.ndarray, sample_time_s: float, masked: np.ndarray
 ) -> list[Flag]:
-    """Flags for samples between two measurements near by, and for those that nothing near by was measured
-    for. A masked sample is neither."""
+    """Returns flags for samples between two near measurements, and for samples without a near measurement. A
+    masked sample gets neither."""
     _, _, distance_s, off = neighbours
     off = off[~masked[off]]
     is_far = distance_s[off] > (0.5 + ON_GRID) * sample_time_s
@@ -425,8 +430,8 @@ def _rate_flags(name: str, time_s: np.ndarray, interval: float, sample_time_s: f
 def _step_flags(
     name: str, time_s: np.ndarray, values: np.ndarray, effect: _Effect | None, sample_time_s: float
 ) -> list[Flag]:
-    """Flags for commands that change between two samples. They act from the next sample on; a command that
-    another overtakes before that sample is lost."""
+    """Returns flags for commands that change between two samples. They act from the next sample on. A command
+    is lost if another one replaces it before that sample."""
     if effect is None:
         return []
     k, late, counts = effect

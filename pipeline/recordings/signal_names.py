@@ -1,8 +1,8 @@
-"""What the name of a recorded signal says: its words, its unit, and the kind of signal that they mean.
+"""Reads the name of a recorded signal: its words, its unit, and the kind of signal that they mean.
 
-The words are those of PLCs, temperature controllers, printers and loggers in English, German, French,
-Spanish and Italian. A name is split at signs, digits and capitals and written in ASCII (ö becomes oe, é
-becomes e), so that `TIst`, `T_ist` and `T.Ist` have the same words. A pattern below matches whole words.
+The words are those of PLCs, temperature controllers, printers and loggers in English, German, French, Spanish
+and Italian. A name is split at punctuation, digits and capitals and written in ASCII (ö becomes oe, é becomes
+e), so `TIst`, `T_ist` and `T.Ist` have the same words. A pattern below matches whole words.
 """
 
 import functools
@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 
 class Name(NamedTuple):
-    """The words of a name without its unit, one space between them; the kind of its unit, "" for none
-    ("degC", "K", "degF", "percent", "speed", "electric", "other"); and the unit as it is written."""
+    """The words of a name without its unit, separated by one space; the kind of its unit, "" for none
+    ("degC", "K", "degF", "percent", "speed", "electric", "other"); and the unit as written."""
 
     words: str
     kind: str
@@ -21,7 +21,8 @@ class Name(NamedTuple):
 
 
 def _pattern(words: str) -> re.Pattern[str]:
-    """Any of the words, which are separated by blanks; _ stands for the blank inside one, * for letters."""
+    """Returns a pattern for any of the words, which are separated by blanks. In a word, _ stands for an
+    optional blank, * for any letters."""
     alternatives = "|".join(words.split()).replace("*", r"\w*").replace("_", " ?")
     return re.compile(rf"(?<!\w)(?:{alternatives})(?!\w)")
 
@@ -44,7 +45,7 @@ _UNITS = {
     ),
 }
 _BRACKET = re.compile(r"[\[({<]\s*([^\[\](){}<>]+?)\s*[\])}>]")
-# a unit of one letter stands in brackets, or is a temperature's behind _ or a number
+# a unit of one letter is in brackets, or is a temperature's after _ or a number
 _TAIL = re.compile(
     r"(?:(?:^|[\s_,;./-])(?:in\s+)?|(?<=\d))("
     r"°\s?[ckf]|℃|deg[ _]?[cf]|celsius|kelvin|fahrenheit|pct|percent|prozent|rpm|upm|[u1r]/min|min-1|tr/min|"
@@ -59,13 +60,13 @@ _INSIDE = (
 
 
 def unit_kind(unit: str) -> str:
-    """The kind of a unit that stands alone, "" for an unknown one."""
+    """Returns the kind of a unit that stands alone, "" for an unknown one."""
     unit = unit.strip().casefold()
     return next((kind for kind, pattern in _UNITS.items() if re.fullmatch(pattern, unit)), "")
 
 
 def _unit(name: str) -> tuple[str, str, str]:
-    """(name without its unit, kind, unit as written)."""
+    """Returns (name without its unit, kind, unit as written)."""
     for bracket in reversed(list(_BRACKET.finditer(name))):
         if not bracket[1].isdigit() and (kind := unit_kind(bracket[1])):
             return name[: bracket.start()] + " " + name[bracket.end() :], kind, bracket[1]
@@ -89,7 +90,7 @@ _LETTERS = str.maketrans(
 
 @functools.lru_cache(maxsize=4096)
 def read_name(name: str, unit: str = "") -> Name:
-    """The words and the unit of a name; `unit` is the one that the file gives beside it, "" for none."""
+    """Returns the words and the unit of a name. `unit`: the one that the file gives with it, "" for none."""
     bare, kind, written = _unit(name.strip())
     if unit:
         kind, written = unit_kind(unit) or "other", unit
@@ -97,7 +98,7 @@ def read_name(name: str, unit: str = "") -> Name:
 
 
 def split(name: str) -> str:
-    """The words of a name in lower-case ASCII with one space between them."""
+    """Returns the words of a name in lower-case ASCII, separated by one space."""
     if not name.isascii():
         name = unicodedata.normalize("NFC", name)
     name = name.translate(_LETTERS)
@@ -113,13 +114,13 @@ SET_POINT = _pattern(
     "requested preset consign* csg cons deseado* deseada* objetivo objectif impost* obiettivo riferimento "
     "nominal* gewenst* ingesteld* zadan* tset"
 )
-# what is measured of it
+# the measured value
 ACTUAL = _pattern(
     "ist istw* *istwert* isttemp* istdreh* istleist* [tn]ist tempist actual* act tempact zoneact pv cpv "
     "process_val* measur* meas mess* gemess* mesur* medid* medicion misur* reale? actuel* attual* actueel "
     "reading current_val* current_temp* akt aktuell* rueckm* feedback fbk tact tmeas"
 )
-# what a controller gives: a word of its own, and one that can also mean a place
+# a controller's output: words that mean only this, and words that can also mean a place
 DUTY = _pattern(
     "stell* *stellgr* *stellwert* lmn op cv mv duty *pwm* power pwr *leistung* puiss* potenz* potenc* pot "
     "einschaltd* tastgrad tastverh* aussteuer* manipulat* wop ssr moc vermogen heat_out* out_heat "
@@ -144,7 +145,7 @@ PLACE = _pattern(
     "die werkzeug* filiere filiera matriz adapt* flansch* flange bed *bett cama piatto plateau hot_end* "
     "tool chamber* *kammer mou?ld moule molde stampo manifold hot_runner heisskanal melt z"
 )
-# what turns, blows or conveys: by its own words, or by a device that may have heaters too
+# speed and flow: words for the quantity, and words for devices that may also have heaters
 SPEED = _pattern(
     "drehz* *drehzahl* speed* *speed rpm upm umdreh* giri vitesse* velocid* velocit* vel *geschw* snelh* "
     "toerent* regime fan fans *fan *luefter* *geblaese* ventilat* ventilad* ventol* blower *durchsatz* "
@@ -157,7 +158,7 @@ MOVER = _pattern(
     "*pump* pomp* bomba spindle spindel valve* ventil* vanne* valvula* valvola* agit* mixer vfd* freq* "
     "*umrichter inverter plunger* piston* kolben* hopper"
 )
-# temperatures that no controller holds: of the surroundings, and of devices
+# temperatures that are not controlled: of the surroundings, and of devices
 ROOM = _pattern(
     "room* *raum* umgeb* ambi* amb hallen* aussen* outdoor outside exter* estern* sala stanza habitacion "
     "omgeving environment* env enclosure werkstatt workshop coolant *wasser* water* eau agua acqua air "
@@ -169,7 +170,7 @@ DEVICE = _pattern(
     "*motor* moteur* oil *oel huile aceite olio *lager bearing* inverter *umrichter* psu battery hydrau* "
     "dew* taupunkt*"
 )
-# limits, settings, modes, counts; and quantities of which no temperature's model is made
+# limits, settings, modes, counts; and quantities that no temperature model uses
 SETTING = _pattern(
     "*alarm* allarm* limit* *grenz* lim hihi lolo max* min maximum minimum kp ki kd tn tv xp gain "
     "*regelabw* deviation *abweich* ecart scarto desviacion error* fehler* auto* manu* mode modo "
@@ -188,16 +189,17 @@ ELECTRIC = _pattern("*current *strom ampere* amps courant corrent* corriente vol
 
 
 def says(pattern: re.Pattern[str], words: str) -> bool:
-    """Whether the words of a name hold one of the pattern's."""
+    """Returns whether the words of a name contain one of the pattern's."""
     return pattern.search(words) is not None
 
 
 def any_of(*patterns: re.Pattern[str]) -> re.Pattern[str]:
-    """The words of all these patterns."""
+    """Returns a pattern for the words of all these patterns."""
     return re.compile("|".join(pattern.pattern for pattern in patterns))
 
 
 def loop_letter(words: str) -> str:
-    """The measured variable of a loop's tag (ISA 5.1): "t" of TIC 101, "s" of ST 201; "" without a tag."""
+    """Returns the measured variable of a loop's tag (ISA 5.1): "t" of TIC 101, "s" of ST 201; "" without a
+    tag."""
     tag = re.search(r"(?<!\w)([a-z])(?:t|e|i|ic|c|ir|rc|it|y) (?!1000?(?!\d))\d{2,}", words)
     return tag[1] if tag else ""

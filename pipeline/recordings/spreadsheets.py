@@ -1,7 +1,8 @@
-"""Spreadsheets (.xlsx): the sheet with the most numbers as a table.
+"""Reads spreadsheets (.xlsx): the sheet with the most numbers as a table.
 
 The cells are read by python-calamine, which is compiled: a million cells take a second, 20 times less than
-with openpyxl. It makes room for the whole rectangle up to the last cell, so that this is bounded first.
+with openpyxl. It allocates the whole rectangle up to the last cell, so the size of this rectangle is checked
+first.
 """
 
 import datetime
@@ -37,9 +38,11 @@ _EPOCH = datetime.datetime(1970, 1, 1)
 
 
 def load_spreadsheet(path: Path) -> WholeTable:
-    """The largest sheet of a workbook; its header is the row above the numbers, with a row of units between.
+    """Returns the sheet with the most numbers in a workbook. Its header is the row above the numbers; a row
+    of units may be between.
 
-    Dates are times. Raises ValueError with the row for text amid numbers, and for a damaged workbook.
+    Dates are times. Raises ValueError with the row if a column of numbers contains text, or if the workbook
+    is damaged.
     """
     _check_size(path)
     try:
@@ -106,7 +109,7 @@ def _table(path: Path, sheet: str, rows: list[list[Any]], notes: list[Note]) -> 
 
 
 def _join_dates(stamps: dict[str, np.ndarray], of_day: set[str], texts: dict[str, str]) -> None:
-    """Puts the column of the date and that of the time of day beside it together."""
+    """Joins the column of the date and the column of the time of day that belongs to it."""
     dates = [name for name, ns in stamps.items() if name not in of_day and not (ns % DAY_NS).any()]
     for name in of_day:
         if is_time_name(name) and (date := date_column(dates, name)) is not None:
@@ -126,7 +129,8 @@ def _is_time(cell: Any) -> bool:
 def _numbers(
     path: Path, sheet: str, name: str, cells: Sequence[Any], lines: Sequence[int]
 ) -> np.ndarray | None:
-    """The numbers of a column, NaN for empty cells; None for a column of words or times."""
+    """Returns the numbers of a column, NaN for empty cells; None for a column of words or times. Raises
+    ValueError if a column of numbers contains a few words."""
     count = sum(map(_is_number, cells))
     words = [
         i
@@ -144,7 +148,7 @@ def _numbers(
 
 
 def _instants(cells: Sequence[Any]) -> np.ndarray | None:
-    """ns (n,) since 1970, or since midnight for times of day; None if a cell is no time."""
+    """Returns ns (n,) since 1970, or since midnight for times of day; None if a cell is not a time."""
     if not all(map(_is_time, cells)):
         return None
     ns = np.array([_ns(cell) for cell in cells], np.int64)
@@ -164,8 +168,8 @@ def _ns(cell: Any) -> int:
 
 
 def _check_size(path: Path) -> None:
-    """Raises ValueError for a workbook that unpacks to more than LARGEST_UNPACKED bytes, whose last cells
-    stand so far out that its sheets would have more than MOST_CELLS, or with more text than MOST_TEXT."""
+    """Raises ValueError if a workbook unpacks to more than LARGEST_UNPACKED bytes, if its last cells are so
+    far out that its sheets would have more than MOST_CELLS, or if it has more text than MOST_TEXT."""
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
@@ -195,7 +199,7 @@ def _check_size(path: Path) -> None:
 
 
 def _size(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[int, int, int]:
-    """(last row, last column, cells with a shared text) of a sheet."""
+    """Returns (last row, last column, number of cells with a shared text) of a sheet."""
     rows = columns = texts = 0
     with archive.open(entry) as stream:
         ending = b""
@@ -210,7 +214,7 @@ def _size(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[int, int, i
 
 
 def _longest_text(archive: zipfile.ZipFile) -> int:
-    """Bytes of the longest of the texts that cells share."""
+    """Returns the bytes of the longest text that cells share."""
     longest = length = 0
     if "xl/sharedStrings.xml" not in archive.namelist():
         return 0

@@ -1,10 +1,10 @@
-"""One MCAP recording a deposition trial: camera frames, gantry, plunger command and, where it is
-simulated, the true flow; and the next trial's command.
+"""Reads and writes deposition trials as MCAP recordings: camera frames, gantry, plunger command and, if
+simulated, the true flow. Writes the next trial's command.
 
-Written as any ROS 2 or Foxglove viewer opens it: CDR with the ros2msg texts embedded, in the order of time,
-chunks with CRCs. Read from that form or from a machine's own topics. Equal input gives equal bytes.
+Any ROS 2 or Foxglove viewer opens the files: CDR with the ros2msg texts embedded, in the order of time,
+chunks with CRCs. Reads that form or a machine's own topics. Equal input gives equal bytes.
 
-A recording is read once: the readings of its frames are kept under a hash of its bytes, of the camera's
+A recording is read once. The readings of its frames are kept under a hash of its bytes, of the camera's
 settings and of the code that reads.
 """
 
@@ -25,13 +25,13 @@ from pipeline.store.params import Mapped
 from pipeline.store.tables import BYTES, FLOAT, NONE, TEXT, Column, Schema
 
 SCHEMA, VERSION = "beadline.trial", "1"
-# what a trial has, where our own recordings have it
+# the signals of a trial, and their topics in our own recordings
 POSITION = Source("position_mm", "/gantry:position_mm", "mm")
 SPEED = Source("speed_mm_per_s", "/gantry:speed_mm_per_s", "mm/s")
 COMMAND = Source("command_mm", "/plunger:displacement_mm", "mm")
 FLOW = Source("flow_mm3_per_s", "/true_flow:flow_mm3_per_s", "mm^3/s")
 SOURCES = (POSITION, SPEED, COMMAND, FLOW)
-# of recordings, in which no trial is read
+# endings of recordings that are not read as trials
 OTHER_FORMATS = {".avi", ".bag", ".csv", ".db3", ".mkv", ".mov", ".mp4", ".parquet"}
 TYPES = {
     "/gantry": "beadline_msgs/msg/Gantry",
@@ -58,14 +58,14 @@ Values = tuple[np.ndarray, np.ndarray, np.ndarray, list[str], tuple[float, float
 
 
 class TrialConditions(NamedTuple):
-    """What a trial was run with, kept in the recording's metadata.
+    """The conditions of a trial, kept in the recording's metadata.
 
-    `trial` counts from 0, `law` names what made the command. `routine` counts the training routines from 0;
-    its plan is off_s, on_s, pause_s of the gantry, on_s again and tail_s, at one speed.
+    `trial` counts from 0; `law`: name of what made the command; `routine` counts the training routines from
+    0. The plan of a routine is off_s, on_s, pause_s of the gantry, on_s again and tail_s, at one speed.
 
-    A bead w_px wide is (w_px - offset_px) / px_per_mm wide, and its section follows from the contact angle;
-    a column of the image lies at gantry position + (column - nozzle_column) mm_per_px, negative where the
-    line trails to higher columns.
+    A bead of w_px pixels is (w_px - offset_px) / px_per_mm wide in mm. Its section follows from the contact
+    angle. A column of the image is at gantry position + (column - nozzle_column) mm_per_px. mm_per_px is
+    negative if the line trails to higher columns.
     """
 
     material: str
@@ -92,7 +92,7 @@ class TrialConditions(NamedTuple):
 
 
 class TrialSignals(NamedTuple):
-    """What a machine did in one trial, on one clock time_s (T,): gantry, plunger command and, where it is
+    """The signals of a machine in one trial, on one clock time_s (T,): gantry, plunger command and, if
     simulated, the true flow; all (T,)."""
 
     time_s: np.ndarray
@@ -103,10 +103,10 @@ class TrialSignals(NamedTuple):
 
 
 class TrialRecording(NamedTuple):
-    """A recording as it was made: signals {name: (time_s (n,), values (n,))} on their own clocks,
-    frames, and notes of what was damaged or left out.
+    """A recording as it was made: signals {name: (time_s (n,), values (n,))} on their own clocks, frames, and
+    notes on what was damaged or left out.
 
-    conditions is None where the recording says nothing of them.
+    `conditions` is None if the recording does not have them.
     """
 
     path: str
@@ -127,12 +127,12 @@ def write_trial(
     *,
     encoding: str,
 ) -> None:
-    """One recording of frames (time_s, (height, width) uint8 or uint16) and of signals; frames are taken
-    one by one, memory is that of a chunk.
+    """Writes one recording of frames (time_s, (height, width) uint8 or uint16) and of signals. Frames are
+    taken one by one, so only one chunk is in memory.
 
-    `encoding` is "jpeg" (quality 95, 8 bits only), "png" (level 1) or "raw". Raises ValueError, nothing
-    written, for lengths that differ, values that are not finite, times that do not run forward, frames of
-    changing size or kind, no frame, and frames and signals that do not overlap in time.
+    `encoding` is "jpeg" (quality 95, 8 bits only), "png" (level 1) or "raw". Raises ValueError, and writes no
+    file, if lengths differ, values are not finite, times do not run forward, frames change in size or type,
+    there is no frame, or frames and signals do not overlap in time.
     """
     time_s = signals.time_s
     columns = [
@@ -146,8 +146,8 @@ def write_command(
     path: str | Path, conditions: TrialConditions, *, time_s: np.ndarray, command_mm: np.ndarray,
     speed: bool = False,
 ) -> None:  # fmt: skip
-    """The next trial's command u (T,) in mm as path.csv (time_s, displacement_mm; speed_mm_per_s if it is a
-    speed) and path.mcap; `path` has no ending. Raises ValueError as write_trial does."""
+    """Writes the next trial's command u (T,) in mm as path.csv (time_s, displacement_mm; speed_mm_per_s if it
+    is a speed) and path.mcap; `path` has no ending. Raises ValueError as write_trial does."""
     tables = tables_of(path, time_s, [(COMMAND, command_mm)])
     write_frames(f"{path}.mcap", tables, TYPES, time_s, None, (SCHEMA, _metadata(path, conditions)))
     artifacts.write_csv(
@@ -172,7 +172,7 @@ def _metadata(path: str | Path, conditions: TrialConditions) -> dict[str, str]:
 
 
 def _crc(pairs: dict[str, str]) -> str:
-    """Of all pairs: a metadata record stands outside the chunks and has no CRC of its own."""
+    """Returns the CRC of all pairs. A metadata record is outside the chunks and has no CRC of its own."""
     return f"{zlib.crc32(repr(sorted(pairs.items())).encode()):08x}"
 
 
@@ -182,15 +182,16 @@ def _crc(pairs: dict[str, str]) -> str:
 def open_trial(
     path: str | Path, *, image: str, time: str, mapping: Mapping[str, Mapped], unreadable_share: float
 ) -> TrialRecording:
-    """A recording through the topics of section `camera`. Raises ValueError as read_trial does."""
+    """Returns a recording, read through the topics of section `camera`. Raises ValueError as read_trial
+    does."""
     return read_trial(
         path, sources=sources(mapping), image=image, time=time, unreadable_share=unreadable_share
     )
 
 
 def sources(mapping: Mapping[str, Mapped]) -> tuple[Source, ...]:
-    """Where a recording has our signals, `mapping` in place of our own topics. Raises ValueError for a signal
-    that no trial has, and for another unit."""
+    """Returns the sources of our signals in a recording; those in `mapping` replace our own topics. Raises
+    ValueError if a mapped signal does not belong to a trial, or has another unit."""
     by_signal = {source.signal: source for source in SOURCES}
     for name, place in mapping.items():
         if name not in by_signal:
@@ -209,8 +210,8 @@ def sources(mapping: Mapping[str, Mapped]) -> tuple[Source, ...]:
 
 
 def trial_paths(folder: Path) -> list[Path]:
-    """The recordings of trials below a folder, without those that a person excluded. Raises ValueError,
-    naming the file, for a recording in another format."""
+    """Returns the recordings of trials below a folder, without those that a person excluded. Raises
+    ValueError, naming the file, if a recording has another format."""
     other = next((p for p in sorted(folder.rglob("[!.]*")) if p.suffix.lower() in OTHER_FORMATS), None)
     if other:
         raise ValueError(
@@ -228,11 +229,11 @@ def group_trials(
     nozzle: str,
     routines: Sequence[Mapping[str, float]],
 ) -> dict[tuple[str, int], list[TrialRecording]]:
-    """Recordings by (material, number of the routine), in the order of their trials. A routine is its plan
-    {field of TrialConditions: value}, at the place of its number.
+    """Returns the recordings by (material, number of the routine), in the order of their trials. A routine is
+    its plan {field of TrialConditions: value}, at the index of its number.
 
-    Raises ValueError, naming the file, for an unknown material, nozzle or routine, a routine that is planned
-    otherwise, and if a trial is missing or there twice.
+    Raises ValueError, naming the file, if a material, nozzle or routine is unknown, if a routine has another
+    plan, or if a trial is missing or exists twice.
     """
     groups: dict[tuple[str, int], dict[int, TrialRecording]] = {}
     for recording in recordings:
@@ -259,7 +260,8 @@ def group_trials(
 
 
 def check_conditions(recording: TrialRecording) -> TrialConditions:
-    """What a trial was run with. Raises ValueError if its recording does not say, or says what cannot be."""
+    """Returns the conditions of a trial. Raises ValueError if its recording does not have them, or if they
+    are impossible."""
     conditions = recording.conditions
     if conditions is None:
         raise ValueError(
@@ -311,8 +313,8 @@ def _check_setup(
 
 
 def first_and_last(recordings: Iterable[TrialRecording]) -> list[Path]:
-    """Of recordings with conditions the paths of the first and the last trial of each material, in the order
-    of their names."""
+    """Returns the paths of the first and the last trial of each material, in the order of their names.
+    Recordings without conditions are left out."""
     by_material: dict[str, list[tuple[int, Path]]] = {}
     for recording in recordings:
         conditions = recording.conditions
@@ -329,15 +331,15 @@ def read_trial(
     time: str = "",
     unreadable_share: float,
 ) -> TrialRecording:
-    """A trial of `write_trial`, or a machine's own recording through `sources`, which map position_mm,
-    speed_mm_per_s, command_mm and, if there is one, flow_mm3_per_s.
+    """Returns a trial of `write_trial`, or a machine's own recording through `sources`, which map
+    position_mm, speed_mm_per_s, command_mm and, if there is one, flow_mm3_per_s.
 
-    `image` names the image topic, by default the only one; `time` the clock: log_time (the default),
-    publish_time, or the field of a stamp that every topic has, such as header.stamp. A clock of the
-    calendar is counted from the record's first whole second. Raises ValueError, one sentence, if
-    the file cannot be read, for a topic that is not there, and for frames and signals that do not
-    overlap in time; what is damaged is left out and noted. At most `unreadable_share` of the frames
-    may turn out not to be decodable when they are asked for.
+    `image`: the image topic, by default the only one; `time`: the clock, which is log_time (the default),
+    publish_time, or the field of a time stamp that every topic has, such as header.stamp. If the clock is a
+    calendar's, time counts from the record's first whole second. Raises ValueError, one sentence, if the file
+    cannot be read, if a topic does not exist, or if frames and signals do not overlap in time. Damaged parts
+    are left out and noted. At most `unreadable_share` of the frames may turn out not to be decodable when
+    they are read later.
     """
     path = Path(path)
     # only the true flow, which no machine knows, may be absent if its source is ours
@@ -414,8 +416,8 @@ def recall(
     code: Sequence[Path],
     read: Callable[[], Values],
 ) -> Values:
-    """The readings of a recording out of `folder`, else those that `read` makes, which are kept if there is a
-    frame. An entry is named by the hash of the recording, of the settings, and of the code that reads."""
+    """Returns the readings of a recording from `folder`, or else from `read`; these are then kept if there is
+    a frame. An entry is named by the hash of the recording, of the settings, and of the code that reads."""
     what = ((artifacts.sha256(recording), settings), [artifacts.sha256(path) for path in code])
     place = folder / f"{joblib.hash(what)}.parquet"
     entry = _recall_entry(place)
@@ -443,7 +445,7 @@ def _remember(place: Path, values: Values) -> None:
 
 
 def _recall_entry(place: Path) -> Values | None:
-    """The readings of an entry; None if there is none, or if the checksums of its pages do not hold."""
+    """Returns the readings of an entry; None if it does not exist, is empty, or is damaged."""
     try:
         table = artifacts.read_table(place, READINGS)
     except ValueError:

@@ -1,8 +1,8 @@
-"""Frames of a camera that runs: a folder that fills with pictures, an MCAP recording that grows, snapshots
-over HTTP.
+"""Reads the frames of a running camera from a folder that fills with pictures, an MCAP recording that grows,
+or snapshots over HTTP.
 
-A source is asked again and again and gives what came since. What is half-written is left for the next time;
-what is broken comes as a frame with the reason; a source that is not there is waited for.
+A source is read again and again and returns what is new. Half-written data is left for the next call. A
+broken picture is returned as a frame with the reason. A source that does not exist yet is waited for.
 """
 
 import base64
@@ -27,21 +27,21 @@ from pipeline.recordings.messages import Channel, Decode, decoder, fields, plain
 from pipeline.recordings.nozzle_frames import Topics
 
 PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
-# a picture that is not whole and has not grown for so long is broken
+# an incomplete picture that has not grown for this long is broken
 SETTLE_S = 2.0
-# between two looks at a folder or a recording
+# pause between two looks at a folder or a recording
 LOOK_S = 0.05
-# of one snapshot: seconds to wait for it, and bytes that are read
+# for one snapshot: longest wait in seconds, and most bytes that are read
 TIMEOUT_S, LARGEST_PICTURE = 2.0, 32 << 20
 COPY = "the frame is a copy of the one before"
-# what a printer can be told; beyond it a number of a recording is no setpoint
+# the range of a printer's settings; a number beyond it is no setpoint
 PLAUSIBLE = {"flow_percent": (0.0, 1000.0), "temperature_degC": (0.0, 600.0)}
 
 
 class CameraFrame(NamedTuple):
-    """A frame (height, width) uint8 or uint16, or in its place the reason why there is none, at time_s of its
-    source's clock; what the source says of flow in percent, temperature in degC, travel direction in degrees
-    and tip (x, y) in px, NaN where it says nothing; print_id "" likewise."""
+    """A frame (height, width) uint8 or uint16, or the reason why there is none, at time_s of its source's
+    clock. `flow`: percent; `temperature`: degC; `direction_deg`: travel direction in degrees; `tip`: (x, y)
+    in px. They are NaN, and print_id is "", if the source does not give them."""
 
     name: str
     time_s: float
@@ -54,8 +54,8 @@ class CameraFrame(NamedTuple):
 
 
 def source(place: str, topics: Topics, *, rate_hz: float) -> "FrameSource":
-    """The source that a path or an address names. Raises ValueError for an address that is none, and for a
-    file that is no recording."""
+    """Returns the source that a path or an address names. Raises ValueError if the address cannot be used, or
+    if a file is not a recording."""
     if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", place):
         return Snapshots(place, rate_hz)
     if place.lower().endswith(".mcap") and not Path(place).is_dir():
@@ -69,7 +69,7 @@ def source(place: str, topics: Topics, *, rate_hz: float) -> "FrameSource":
 
 
 def display_name(place: str) -> str:
-    """A source's name as it may be shown: of an address without user and password."""
+    """Returns a source's name to show: an address without user and password."""
     return _without_secret(urllib.parse.urlsplit(place)) if "://" in place else place
 
 
@@ -77,7 +77,8 @@ def display_name(place: str) -> str:
 
 
 class Folder:
-    """Pictures in the order in which they were written. A file is looked at once, as soon as it is whole."""
+    """Pictures of a folder in the order in which they were written. A file is read once, as soon as it is
+    whole."""
 
     def __init__(self, path: Path, clock: Callable[[], float] = time.monotonic) -> None:
         self.path, self.clock, self.rest_s = path, clock, LOOK_S
@@ -102,7 +103,8 @@ class Folder:
         self.ended = not self.unfinished
 
     def _new(self) -> Iterator[tuple[str, int, int]]:
-        """(name from the folder on, ns when it was written, bytes) of pictures that were not looked at."""
+        """Yields (name relative to the folder, time when it was written in ns, bytes) of pictures not yet
+        read."""
         began = time.monotonic()
         for root, folders, names in os.walk(self.path):
             folders[:] = [name for name in folders if not name.startswith(".")]
@@ -114,11 +116,11 @@ class Folder:
                 with contextlib.suppress(OSError):  # a camera may remove its oldest
                     about = os.stat(os.path.join(root, name))
                     yield inside, about.st_mtime_ns, about.st_size
-        # a folder of very many names is looked through less often
+        # a folder with very many files is searched less often
         self.rest_s = max(LOOK_S, 5 * (time.monotonic() - began))
 
     def _picture(self, name: str, time_s: float, size: int) -> CameraFrame | None:
-        """None where the file is still being written."""
+        """Returns the frame of a picture, None if the file is still being written."""
         path = self.path / name
         try:
             data = path.read_bytes()
@@ -140,12 +142,12 @@ class Folder:
 
 
 def _number_key(name: str) -> list:
-    """A key that puts image-9 before image-10."""
+    """Returns a sort key that puts image-9 before image-10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def _has_end(data: bytes) -> bool:
-    """Whether a JPEG or PNG has its end mark; of other formats the decoder decides."""
+    """Returns whether a JPEG or PNG has its end mark. Other formats are left to the decoder."""
     if data.startswith(b"\xff\xd8"):
         return data.rfind(b"\xff\xd9", max(0, len(data) - 4096)) > 0
     return b"IEND" in data[-64:] if data.startswith(b"\x89PNG") else bool(data)
@@ -155,7 +157,7 @@ def _has_end(data: bytes) -> bool:
 
 
 class RecordingSource:
-    """Frames of the image topic, with the setpoints that held when they were taken."""
+    """Frames of the image topic, with the setpoints that applied when they were taken."""
 
     def __init__(self, path: Path, where: Topics) -> None:
         self.path, self.where, self.rest_s = path, where, LOOK_S
@@ -170,7 +172,7 @@ class RecordingSource:
 
     @property
     def lacks(self) -> str:
-        """Images among the topics that it has."""
+        """What the recording lacks, in words: a topic with images; and the topics that it has."""
         topics = sorted(self.others_held)
         named = f"{', '.join(topics[:5])}{', ...' if len(topics) > 5 else ''}" if topics else "no messages"
         return f"a topic with images; it holds {named}"
@@ -194,7 +196,8 @@ class RecordingSource:
             self.waits_for = f"{self.path} cannot be read ({error.strerror})"
 
     def _is_camera(self, channel: Channel) -> bool:
-        """The topic of the settings, or else the first with images; another one is told once."""
+        """Returns whether the channel is on the image topic: that of the settings, or else the first with
+        images. Another image topic is reported once."""
         self.camera = self.camera or channel.topic
         if channel.topic != self.camera and channel.topic not in self.others:
             self.others.add(channel.topic)
@@ -227,7 +230,7 @@ class RecordingSource:
         return CameraFrame(name, stamp / 1e9, frame, flow, temperature, direction, (x, y), print_id)
 
     def _hold(self, message: Message) -> None:
-        """Takes over what a message says of our signals."""
+        """Keeps the values of our signals in a message."""
         number = message.channel.id
         if number not in self.decoders:
             self.decoders[number] = self._decoder(message)
@@ -247,7 +250,7 @@ class RecordingSource:
                 self.signals[name] = value
 
     def _decoder(self, message: Message) -> tuple[list[str], Decode] | None:
-        """Our signals that a channel has, and what reads them; None if it has none."""
+        """Returns our signals in a channel, and the function that decodes them; None if it has none."""
         channel = message.channel
         try:
             names = set(fields(channel, [message.data]))
@@ -266,7 +269,7 @@ class RecordingSource:
 
 
 class Snapshots:
-    """A picture for each request. Only the address that was named is asked, without a proxy."""
+    """A picture for each request. Only the given address is requested, without a proxy."""
 
     def __init__(self, address: str, rate_hz: float) -> None:
         parts = urllib.parse.urlsplit(address)
@@ -289,7 +292,8 @@ class Snapshots:
         self.count, self.before = 0, b""
 
     def frames(self) -> Iterator[CameraFrame]:
-        """One picture, or none where the camera does not answer; a new one for each period of the rate."""
+        """Yields one picture, or none if the camera does not answer. The rate sets the time between
+        pictures."""
         began = time.monotonic()
         try:
             data = self._answer()
@@ -302,7 +306,8 @@ class Snapshots:
         self.rest_s = max(0.0, self.period_s - (time.monotonic() - began))
 
     def _answer(self) -> bytes:
-        """The bytes of one answer, whole. A camera that drips is hung up on, in its headers too."""
+        """Returns the bytes of one answer, whole. The connection is closed if the camera answers too slowly,
+        in its headers too."""
         kinds = {"http": http.client.HTTPConnection, "https": http.client.HTTPSConnection}
         connection = kinds[self.parts.scheme](self.parts.hostname or "", self.port, timeout=TIMEOUT_S)
         late = threading.Event()
@@ -329,7 +334,7 @@ class Snapshots:
 
 
 def _read_picture(answer: http.client.HTTPResponse) -> bytes:
-    """The picture of an answer. Raises OSError with the reason if it has none, or not a whole one."""
+    """Returns the picture of an answer. Raises OSError with the reason if it has none, or not a whole one."""
     kind = answer.headers.get_content_type()
     data = b"" if kind.startswith("multipart/") else answer.read(LARGEST_PICTURE + 1)
     problems = (
@@ -358,8 +363,8 @@ def _decode(data: bytes) -> np.ndarray:
 def _new_frame(
     content: bytes | memoryview, previous: bytes, decode: Callable[[], np.ndarray]
 ) -> tuple[np.ndarray | str, bytes]:
-    """The decoded frame, or the reason why there is none, and the digest of its content; `before` is that of
-    the frame before."""
+    """Returns the decoded frame, or the reason why there is none, and the digest of its content. `previous`:
+    digest of the previous frame."""
     digest = hashlib.blake2b(content, digest_size=16).digest()
     try:
         return COPY if digest == previous else decode(), digest
@@ -368,11 +373,11 @@ def _new_frame(
 
 
 def _without_secret(parts: urllib.parse.SplitResult) -> str:
-    """An address as it may be shown: no user, no password."""
+    """Returns an address to show: no user, no password."""
     return parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl()
 
 
-# `frames` gives what came since it was last asked; `waits_for` says why nothing comes, "" if something may;
-# `lacks` what a source that is there has none of; `ended`: nothing more will come; `rest_s`: how long to wait
-# before the next look
+# `frames` yields the new frames since the last call; `waits_for`: why no frame can come, "" if one may;
+# `lacks`: what an existing source does not contain; `ended`: nothing more will come; `rest_s`: how long to
+# wait before the next call
 FrameSource = Folder | RecordingSource | Snapshots

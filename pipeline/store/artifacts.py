@@ -24,7 +24,8 @@ from pipeline.store import params, tables
 from pipeline.store.printable import printable
 from pipeline.store.tables import ARRAYS, Column, Schema
 
-# the libraries of files are imported by the functions that open one: a stage that writes JSON waits for none
+# libraries for files are imported in the functions that use them, so a stage that only writes JSON does not
+# wait for them
 if TYPE_CHECKING:
     import numpy as np
     import pyarrow as pa
@@ -32,13 +33,13 @@ if TYPE_CHECKING:
 DATASETS, REPORTS = Path("datasets"), Path("reports")
 WHOLE = ".whole"  # inside a stage: the folder that it lies in will hold nothing else
 REFUSALS = (ValueError, OSError, MemoryError)  # LinAlgError is a ValueError
-# how XLA, OpenCV and C++ say that their memory ran out
+# the words with which XLA, OpenCV and C++ report that memory ran out
 OUT_OF_MEMORY = ("RESOURCE_EXHAUSTED", "Insufficient memory", "bad_alloc")
 CSV_ROWS = 1 << 15  # written at once: text takes ten times the memory of its numbers
 
-# inside a stage: the folder where what goes to reports/ waits until the stage has ended well
+# inside a stage: the folder in which files for reports/ wait until the stage has ended well
 _waiting: ContextVar[Path | None] = ContextVar("_waiting", default=None)
-# and the fresh folder that becomes datasets/<stage> then
+# inside a stage: the fresh folder that then becomes datasets/<stage>
 _fresh: ContextVar[Path | None] = ContextVar("_fresh", default=None)
 
 
@@ -294,7 +295,7 @@ def write_folder(path: str | Path, files: Mapping[str, str | bytes]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in {**files, WHOLE: ""}.items():
         (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
-    # all are written before the first is waited for: a disk takes many at once
+    # all files are written before waiting for the first, because a disk handles many at once
     for name in files:
         _on_disk(folder / name)
     if not waiting:
@@ -641,7 +642,8 @@ def write_weights(
     from safetensors.numpy import save_file
 
     metadata = {"schema": name, **about}
-    # the library writes metadata in the order of a hash that differs between processes, so one key has all
+    # the library writes metadata in the order of a hash that differs between processes, so a single key holds
+    # everything
     packed = {"beadline": "\n".join(f"{key}={metadata[key]}" for key in sorted(metadata))}
     with beside(path) as temporary:
         save_file(

@@ -18,7 +18,7 @@ from pipeline.store.params import Execution
 from pipeline.store.pins import PINS
 
 CODE = Path(__file__).resolve().parents[1]
-# the packages whose sums the pins of `run` fix
+# the packages whose order of summation is fixed by the pins of `run`
 PACKAGES = ("numpy", "scipy", "jaxlib", "opencv-python-headless", "pyarrow", "scikit-learn")
 
 
@@ -36,7 +36,7 @@ def run_all(
         with _cluster(execution.scheduler, remains) as client:
             from distributed.protocol.pickle import dumps  # of local functions too
 
-            # not by joblib: it leaves an array with one worker, and loses it with that
+            # not by joblib, which keeps an array at one worker and loses it with this worker
             futures = client.map(_there, [*map(dumps, calls)], asked=surroundings(), pure=False)
             futures.reverse()
             while futures:

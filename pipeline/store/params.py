@@ -58,7 +58,7 @@ class Section(pydantic.BaseModel):
     tuples. NaN and infinity are refused.
     """
 
-    # built when a section is first checked: that takes longer than the import of most stages
+    # the model is built when a section is first checked, because this takes longer than importing most stages
     model_config = pydantic.ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True
     )
@@ -148,7 +148,7 @@ def _load(model: type[S], section: str, path: str | Path) -> S:
     sections = files(path)
     values = _section(section, path)
     try:
-        # through JSON, where strictness knows no difference between a list and a tuple
+        # through JSON, because strict checks there accept a list for a tuple
         return model.model_validate_json(json.dumps(values))
     except pydantic.ValidationError as error:
         problems = _sentences(model, section, error.errors())

@@ -1,8 +1,8 @@
-"""Handles params as text: reads them with DVC's own parser, writes a value into a file without changing its
-comments, order and other lines, and writes whole sections.
+"""Params as text: read by DVC's own parser; a value written into a file whose comments, order and other lines
+stay as they are; and whole sections.
 
-(The round trip of ruamel.yaml moves the entries of lists and writes null as nothing. It would change 64
-lines of the two files as shipped.)
+(The round trip of ruamel.yaml moves the entries of lists and writes null as nothing: 64 lines of the two
+files as shipped would change.)
 """
 
 import copy
@@ -24,8 +24,8 @@ _TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("bool", "null", "int", "float"
 
 
 def read(path: str | Path) -> Any:
-    """Returns what the file holds, unchecked. Raises ValueError with file and line if it is not YAML or has a
-    key twice."""
+    """What the file holds, unchecked. Raises ValueError with file and line if it is no YAML or has a key
+    twice."""
     try:
         size = Path(path).stat().st_size
         if not Path(path).is_file():
@@ -56,7 +56,7 @@ def read(path: str | Path) -> Any:
 
 @functools.lru_cache(maxsize=8)
 def _parsed(text: str) -> Any:
-    """Returns YAML 1.2 as DVC reads it, by the same parser: 1e-6 is a number, `no` and `on` are words."""
+    """YAML 1.2 as DVC reads it, by the same parser: 1e-6 is a number, `no` and `on` are words."""
     yaml = YAML(typ="safe", pure=True)
     yaml.max_depth = DEEPEST
     try:
@@ -74,8 +74,8 @@ def _parsed(text: str) -> Any:
 
 
 def _check(node: Node) -> None:
-    """Raises MarkedYAMLError for text that a reader of the file would misread, and for what has no JSON type.
-    Anchors are refused, so aliases need no check."""
+    """Raises MarkedYAMLError for what a reader of the file would take for something else, and for what JSON
+    has no type for. An alias is its anchor's node, so that it is not reached."""
     if node.anchor:
         raise _refused(node, f"the anchor &{node.anchor} is refused; write the values out at each place")
     tag = str(node.tag)
@@ -110,7 +110,7 @@ def _refused(node: Node, problem: str) -> MarkedYAMLError:
 
 
 def written(value: Any, *, flow: bool = False) -> str:
-    """Returns the value as YAML, in the order of its keys; `flow`: on one line."""
+    """The value as YAML, in the order of its keys; `flow`: on one line."""
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = flow
     yaml.sort_base_mapping_type_on_output = False
@@ -123,10 +123,10 @@ def written(value: Any, *, flow: bool = False) -> str:
 
 
 def replaced(text: str, dotted: str, lines: Sequence[str]) -> str:
-    """Returns `text` with a new value for a key such as plant.inputs: a scalar or [...] on the key's line, or
+    """`text` with the value of a key such as plant.inputs replaced: by a scalar or [...] on its line, or by
     the entries of a block below the key.
 
-    Raises ValueError if the text does not have the key.
+    Raises ValueError for a key that the text does not have.
     """
     key, value = _nodes(text, dotted)
     start, end = value.start_mark.index, _end(value)
@@ -147,8 +147,8 @@ def replaced(text: str, dotted: str, lines: Sequence[str]) -> str:
 
 
 def inserted(text: str, dotted: str, lines: Sequence[str]) -> str:
-    """Returns `text` with a key that its section lacks, such as plant.disturbances, before the section's
-    first key. The entries of its value are below the key, as in `replaced`. Raises ValueError if the section
+    """`text` with a key that its section lacks, such as plant.disturbances, ahead of the section's first
+    key; the entries of its value stand below it, as `replaced` has them. Raises ValueError for a section that
     is missing."""
     section, _, key = dotted.rpartition(".")
     _, value = _nodes(text, section)
@@ -158,7 +158,7 @@ def inserted(text: str, dotted: str, lines: Sequence[str]) -> str:
 
 
 def _comment(text: str, key: Node, line_end: int) -> str:
-    """Returns the comment after the colon of a key that has its value on the lines below."""
+    """The comment behind the colon of a key whose value stands below it."""
     rest = text[key.end_mark.index : line_end].lstrip().removeprefix(":").strip()
     return f"  {rest}" if rest else ""
 
@@ -176,8 +176,7 @@ def _nodes(text: str, dotted: str) -> tuple[Node, Node]:
 
 
 def _end(node: Node) -> int:
-    """Returns the position of the node's last character. The end that YAML gives for a block comes after the
-    block's comments."""
+    """Where the node's last character stands; the end that YAML gives a block lies behind its comments."""
     if isinstance(node, CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)

@@ -2,10 +2,10 @@
 
 import re
 
-# what moves a cursor, colours, hides or turns text round: C0 without tab and line feed, DEL and C1, marks of
-# direction, separators of lines, halves of pairs (of file names that are no UTF-8)
+# characters that move a cursor, or colour, hide or reverse text: C0 without tab and line feed, DEL and C1,
+# direction marks, line separators, surrogate halves (from file names that are not UTF-8)
 _UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-# the same behind the backslash of JSON, which a script would turn back
+# the same characters as JSON escapes, which a script would convert back
 _IN_JSON = re.compile(
     r"\\u(?=00[01][0-9a-f]|007f|00[89][0-9a-f]|061c|200[ef]|202[89a-e]|206[6-9]|d[89ab]|d[c-f])",
     re.IGNORECASE,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 # types of columns, by Arrow's names; a list is list<double>, bytes of one length are binary[768]
 TEXT, FLOAT, BOOL, COUNT, INDEX, BYTES = "string", "double", "bool", "int64", "int32", "binary"
 
-# the unit of what has none
+# the unit of a quantity without unit
 NONE = "1"
 
 

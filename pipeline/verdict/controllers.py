@@ -3,7 +3,7 @@ controller that is not in the table keeps its own name."""
 
 from pipeline.temperature.controllers.table import BY_NAME, CONTROLLERS
 
-# shown beside the others, never the best of them
+# shown with the others, but never named the best
 YARDSTICKS = tuple(controller.name for controller in CONTROLLERS if controller.kind == "reference")
 
 

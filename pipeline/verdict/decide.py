@@ -37,9 +37,9 @@ from pipeline.verdict.verdict import (
 from pipeline.verdict.wording import name_first, places_of, straddling, worded, words_of
 
 NEVER = Missing(OPEN, "The nightly job measures it and has not run")
-# limits that the comparison resolves for the machine: declared, or those of a recorded machine's own pace
+# limits that the comparison sets for the machine: declared ones, or those from a recorded machine's own speed
 RESOLVED = ("settled_error_degC", "settling_s", "heating_s", "overshoot_degC")
-# judged on the plant that a tenth of all plants lie below
+# judged at the value below which a tenth of all plants lie
 MARGINS = ("disk", "delay_s")
 # rules that no row holds: only the machine shows drift, once the controller runs; the stage `certify` refuses
 DRIFT = "drift"
@@ -341,7 +341,7 @@ def _not_passed(
         if named
         else f"No contestant passes; {in_a_sentence(subject.name)} comes closest."
     )
-    # drift is of the machine, not of a controller
+    # drift concerns the machine, not a controller
     who = "" if first.name == "drift" else comes
     why = first.reason or _drift_sentence(first)
     open_too = [rule.name for rule in subject.rules if rule.state == OPEN and rule.name != DRIFT]

@@ -31,18 +31,20 @@ from pipeline.verdict.verdict import (
 )
 
 LOOP = "deposition"
-# errors closer than this, in points of on-off control's, are one: the simpler composer is taken
+# errors that differ by less than this, in points of on-off control's, count as equal: the simpler composer is
+# used
 SAME = 0.5
 # learning a part itself is as good as a composer if its error is at most this many times as large
 AS_GOOD = 1.1
-# the simplest first; what learned the very part is a reference, and no composer of another
+# the simplest first. The signal learned on the part itself is a reference, because it cannot compose another
+# part
 COMPOSERS = tuple(row.name for row in TABLE if row.kind != "reference")
 REFERENCE = next(row.name for row in TABLE if row.kind == "reference")
 BASELINE = next(row.name for row in TABLE if row.kind == "baseline")
 OURS, LIBRARY = (
     next(row.name for row in TABLE if row.kind == kind) for kind in ("model-based", "data-driven")
 )
-# the rules by which the library puts its signals together; the better one answers for data-driven composers
+# the library's rules for joining its signals; the better one represents the data-driven composers
 RULES_OF_LIBRARY = tuple(row.name for row in TABLE if row.kind == "data-driven")
 NAMES = {row.name: row.heading for row in TABLE}
 KIND = {row.name: row.kind for row in TABLE}
@@ -56,14 +58,14 @@ USE = {
     "superposition": "the library by superposition",
     "basis": "the basis functions",
 }
-# what is made from the trials of the deposition loop
+# tables made from the trials of the deposition loop
 COMPOSED = ("library", "learned", "signals", "scores", "prints", "tasks", "lines", "conformance")
 # what to do if no trial is recorded yet
 FIRST_TRIALS = (
     "Play the commands of datasets/train_ilc/next, put their recordings into datasets/raw/deposition, and "
     "run ./run dvc repro."
 )
-# in the place of a forecast that a report of an earlier version does not have
+# replaces the forecast that a report of an earlier version lacks
 NO_FORECAST = {"reason": "the conformance report has none", "trial": "run ./run dvc repro compose_parts"}
 
 
@@ -465,7 +467,7 @@ def where(structure: Structure) -> str:
 
 def _learning(case: Parts, composer: str) -> Reading:
     laws = ("hoelzle_2009",) if KIND[composer] == "data-driven" else ("pixels", "model_inverse")
-    # figures of an earlier version name the best alone
+    # figures of an earlier version have only the best
     keys = [f"{law}.{which}_ratio" for law in laws for which in ("last", "best")]
     ratios = next((ratios for key in keys if (ratios := _each(case.evidence, key))), None)
     if ratios is None:
@@ -576,7 +578,7 @@ def _drive(case: Parts, composer: str) -> Reading:
         if least is None
         else f"the best signal within it leaves {percent(least, 2)} of on\u2011off control’s flow error"
     )
-    # a drive that follows what is asked for up to a little: how much that little is
+    # the error that remains if the drive follows the command almost exactly
     shares = [one.get("least_percent") for place, one in saturations.items() if place not in case.unknown]
     leaves = [share for share in shares if share is not None]
     followed = worst.enough and len(leaves) == len(saturations)
@@ -665,13 +667,13 @@ def verdict(evidence: Evidence) -> Verdict:
     own = use not in (BASELINE, "") and KIND.get(use) == "baseline"
     beside = use if own else data_driven(parts)
     lines = rules(evidence, parts, beside)
-    # the column of the model-based composer, also if nothing is known, or that of the one beside it
+    # the model-based composer's column, also if nothing is known, or that of the other composer
     column = 0 if use in (OURS, "") else 1
     needs = {row.name: row.needed_for for row in rows(LOOP).values()}
     asked = [line[column] for line in lines if column == 0 or "learning" not in needs[line[0].name]]
     judged = [rule for rule in asked if rule.state != UNJUDGED]
-    # what cannot be measured on a machine's own trials does not hold them up; a drive can be declared, and a
-    # forecast that is not judged has a trial that judges it
+    # a rule that cannot be measured on a machine's own trials does not block them. But a drive can be
+    # declared, and there is a trial for each forecast that is not judged
     binding = [
         rule
         for rule in judged

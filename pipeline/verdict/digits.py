@@ -45,8 +45,8 @@ def declared(value: float) -> int:
     return max(0, 2 - math.floor(math.log10(abs(value)))) if exact is None else exact
 
 
-# what a figure may be at most to say something: ten times the yardstick, or hotter than any machine. Beyond
-# it the loop is useless or unstable, and further digits tell nothing
+# the largest meaningful figure: ten times the reference, or hotter than any machine. Beyond it the loop is
+# useless or unstable, and its digits say nothing
 LARGEST = {"%": 1000.0, "°C": 10000.0}
 
 

@@ -111,6 +111,6 @@ def instead(make: Callable[[Missing], Any]) -> Callable[[Callable[..., Any]], Ca
     return decorate
 
 
-# in the place of what needs something that is absent: the gap itself, nothing to say, no rows
+# results if something needed is absent: the gap itself, "", None; an empty list, an empty dict
 or_gap, or_nothing, or_none = instead(lambda gap: gap), instead(lambda gap: ""), instead(lambda gap: None)
 or_empty, or_no_entries = instead(lambda gap: []), instead(lambda gap: {})

@@ -26,7 +26,7 @@ from pipeline.verdict.verdict import (
 )
 
 LOOP = "identification"
-# how the decision on a model begins that is good for no use
+# the beginning of the decision if a model is good for no use
 UNTRUSTED = "Do not trust this model"
 AHEAD, GAINS = "ahead", "gains"
 
@@ -54,7 +54,7 @@ def trust(evidence: Evidence) -> Verdict:
             ("simulate", "to simulate"),
         )
     }
-    # a rule that the design needs comes before one that only another use needs, and that before a reservation
+    # rules that the design needs come first, then those that another use needs, then warnings
     first = None
     for use in ("design", "predict", "simulate"):
         first = first or deciding([rule for key, rule in rules.items() if _needed(key, rule, use)])
@@ -263,7 +263,7 @@ def _residuals(evidence: Evidence, rows: np.ndarray) -> Reading:
 
 def _inputs_left(evidence: Evidence, question: Question) -> Reading:
     table = need(evidence.tables["residuals"])
-    # in closed loop u(t) answers the error of y(t): lag 0 is the controller's
+    # in closed loop u(t) responds to the error of y(t), so lag 0 comes from the controller
     closed = lookup(evidence.figures["identify_plant"], "closed_loop.closed") is True
     pairs = (table["against"] != table["output"]) & (table["lag"] >= int(closed))
     figure, words = _residuals(evidence, pairs & ~table["passed"])

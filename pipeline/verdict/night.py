@@ -74,7 +74,7 @@ def drift(nightly: Any) -> Drift:
     if not changes:
         answer = Missing(OPEN, "The last night had no new recording of the machine to measure it on")
         return Drift(answer, "Not measured.", answer.sentence(), when)
-    # the parameter that moved most of all recordings, against its own noise
+    # of all recordings, the parameter that changed most relative to its own noise
     _, name, percent, half = max(changes)
     size, band = beyond_meaning(percent, "%") or f"{number(percent, 1)} %", beyond_meaning(half, "%")
     text = f"Largest change of the machine: {name}, {size} ± {band or number(half, 1)}."

@@ -39,7 +39,7 @@ def pair_sentence(figures: Figures) -> PairSentence:
     by_structure = _by_structure(entry(pair, "by_structure") or [])
     better, worse = (in_a_sentence(n) for n in ((a, b) if winner != b else (b, a)))
     if winner not in (a, b):
-        # a 90 % interval may leave out zero where p is between 0.05 and 0.1: the level is said
+        # a 90 % interval may exclude zero if p is between 0.05 and 0.1, so the level is stated
         saved = abs(finite(entry(pair, "difference")))
         interval = _interval(pair) if saved <= 90 else ""
         saves = f"the cheaper one saves {number(saved, 1)} %" if interval else ""

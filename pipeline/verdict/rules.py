@@ -17,7 +17,7 @@ from pipeline.verdict.settings import ReportRules
 from pipeline.verdict.verdict import OPEN, PASSED, UNDECIDED, Figure, Missing, Question, Rule, count_of
 
 PATH = Path(__file__).with_name("rules.toml")
-# a figure, and the words that the sentences of its row have places for
+# a figure, and the words for the placeholders in its row's sentences
 Reading = tuple[Figure | Missing, Mapping[str, Any]]
 Limit = float | str
 
@@ -70,7 +70,7 @@ class Row(params.Section):
         return text.format(limit=limit)
 
 
-# what a rule of each loop can keep from passing
+# the uses that a rule of each loop can keep from passing
 USES = {
     "temperature": {"trial"},
     "identification": {"design", "predict", "simulate"},

@@ -223,7 +223,8 @@ def share_text(figure: Figure | Missing) -> str:
 # ---- the rules
 
 
-# of each a pair: what learned, and the best baseline; a rule of the classifier holds for every controller
+# a pair for each rule: the data-driven controller's, and the best baseline's. A rule of the classifier
+# applies to every controller
 Pair = tuple[Rule, Rule]
 
 
@@ -302,8 +303,9 @@ def _share(what: str) -> Callable[[Evidence, Board | None, str], Reading]:
     return read
 
 
-# if a rule lets L percent be lost, controllers that lose L / 3 pass and those that lose 2 L fail in 19 of 20
-# repetitions, from so many runs on of which this many may be lost (binomial; runs that share nothing)
+# if a rule allows L percent of runs to be lost, controllers that lose L / 3 pass, and those that lose 2 L
+# fail, in 19 of 20 repetitions. This needs at least so many independent runs that this many of them may be
+# lost (binomial)
 MAY_BE_LOST, LEAST_RUNS = 5.7, 190.0
 
 
@@ -438,7 +440,7 @@ def undecided(question: Question, figure: Figure, words: Mapping[str, Any]) -> s
     return f" Its interval, {band(figure.low, figure.high, 1)}, straddles that; {more}."
 
 
-# yardsticks of the classifier
+# references for the classifier
 BRIEF = {"svc": "SVC", "width": "width"}
 
 
@@ -561,8 +563,8 @@ def named(board: Board, name: str) -> str:
 
 @instead(lambda gap: PairSentence("Model-based against data-driven: not measured.", None))
 def pair_sentence(choice: Any) -> PairSentence:
-    """Returns the comparison in words, on the same segments: the winner brings so many points more of its
-    runs to the target and keeps them there than the other; or that more segments are needed."""
+    """Returns the comparison in words, on the same segments: "the Bayes filter brings 41.0 points more of its
+    runs to the target and keeps them there than the paper's agent", or that more segments are needed."""
     head, pair = "Model-based against data-driven:", need_figure(choice, "pair")
     gap = need_figure(pair, "difference")
     a, b, winner = str(pair["a"]), str(pair["b"]), pair.get("winner")

@@ -1,5 +1,6 @@
-"""Finds, in the figures of the stages, the figures of each controller of the temperature loop that its rules
-need: as deployed, over all plants, at the 90 % quantile with the band of that quantile."""
+"""Finds the figures of each controller of the temperature loop that its rules need, in the figures of the
+stages. They are for the controller as deployed, over all plants, at the 90 % quantile with the band of that
+quantile."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,10 +13,10 @@ from pipeline.verdict.rules import at_path, rows
 from pipeline.verdict.verdict import OPEN, Figure, Missing, count_of
 
 LOOP = "temperature"
-# of the engineering cost, which the spread of the judged plants moves by more
+# of the engineering cost; the spread of the judged plants changes the cost by more
 ALLOWED_PERCENT = 10.0
 REPEAT = "Run ./run dvc repro evaluate_temperature"
-# figures of the scorecard that come as median and quantile
+# figures of the scorecard with median and quantile
 QUANTILES = (
     "settled_error",
     "peak",

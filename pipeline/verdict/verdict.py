@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 from pipeline.store import artifacts
 
 PASSED, FAILED, UNDECIDED, OPEN = "passed", "failed", "undecided", "not measured"
-# a rule that cannot be judged before somebody declares what it asks about
+# state of a rule that cannot be judged until its subject is declared
 UNJUDGED = "not applicable"
-# the rule of a controller whose certificate is refused; no row holds it
+# the rule for a controller with a refused certificate; it has no row in rules.toml
 CERTIFICATE = "certificate"
 
 
@@ -113,7 +113,7 @@ class Rule(NamedTuple):
         return state(self.question, self.figure)
 
 
-# which rule is named: the first of the gravest state, or the first failed one before any that is open
+# order in which the deciding rule is chosen: by gravity, or failed rules before all that are open
 BY_SEVERITY = ((FAILED,), (UNDECIDED,), (OPEN,))
 FAILED_FIRST = ((FAILED,), (UNDECIDED, OPEN))
 
@@ -153,7 +153,7 @@ class Words(NamedTuple):
 SIMULATION = Words("Pass (simulation): {}.", "Fail (simulation).", "Undecided (simulation).")
 NOT_READY = "Not ready for a supervised trial."
 TRIAL = Words("Ready for a supervised trial: {}.", NOT_READY, NOT_READY)
-# few plants, short searches: neither a simulation nor a trial is passed by them
+# a quick look has few plants and short searches, which is not enough to pass a simulation or a trial
 QUICK = Words("Quick look passed: {}.", "Quick look failed.", "Quick look undecided.")
 
 
@@ -229,7 +229,8 @@ def write(verdicts: Mapping[str, Verdict], folder: str | Path) -> None:
     """Writes each verdict to `folder`/<loop>.json. Equal verdicts give equal bytes."""
     for loop, verdict in verdicts.items():
         lines = [[_encode(rule) for rule in line] for line in verdict.rules]
-        # whom the rules would name, and whose certificate is refused: its certificate is still exported
+        # the controller that the rules would name but whose certificate is refused; the certificate is still
+        # exported
         refused = verdict.subject if verdict.rule == CERTIFICATE else None
         fields = {**verdict._asdict(), "rules": lines, "refused": refused}
         artifacts.write_json(Path(folder) / f"{loop}.json", fields)

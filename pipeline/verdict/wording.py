@@ -11,7 +11,7 @@ from pipeline.verdict.digits import band, beyond_meaning, decimals, declared, qu
 from pipeline.verdict.verdict import Figure, Missing, Question
 
 OFF_THE_SCALE = "off the scale"
-# what an infinite figure is called
+# words for an infinite figure
 INFINITE = {"settling": "never settles", "disk": "unlimited", "delay_s": "unlimited", "data": "unlimited"}
 MOST_PLACES = 6
 
@@ -50,7 +50,8 @@ def worded(question: Question, value: float, places: int) -> str:
 
 
 def banded(question: Question, figure: Figure, places: int) -> str:
-    """Returns the band of a figure, "" if it has none or if one of its ends says nothing."""
+    """Returns the band of a figure, with an end in words if its digits say nothing; "" if both ends are the
+    same."""
     ends = worded(question, figure.low, places), worded(question, figure.high, places)
     if OFF_THE_SCALE in ends or any(map(math.isinf, (figure.low, figure.high))):
         return "" if ends[0] == ends[1] else " to ".join(ends).replace("never settles", "never")
@@ -79,7 +80,7 @@ def words_of(question: Question, figure: Figure, name: str) -> dict[str, Any]:
     sentence for a figure without digits."""
     places = places_of(question, [figure])
     value = worded(question, figure.value, places)
-    # a limit too small for the figure's decimals has its own
+    # a limit too small for the figure's decimals is shown with its own decimals
     exact = (
         places
         if math.isinf(question.limit) or round(question.limit, places) or not question.limit

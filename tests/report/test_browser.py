@@ -187,7 +187,7 @@ def test_a_word_explains_itself_to_pointer_and_keys_and_stands_in_the_list(open_
     page = open_page("temperature")
     word, tip = page.locator("#answer-disk a.term"), page.locator(".tip")
     word.hover()
-    expect(tip).to_contain_text("before it oscillates", use_inner_text=True)
+    expect(tip).to_contain_text("before the loop oscillates", use_inner_text=True)
     page.keyboard.press("Escape")
     expect(tip).not_to_be_visible()
     page.mouse.move(5, 5)

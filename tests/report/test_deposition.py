@@ -146,7 +146,7 @@ def test_on_off_control_may_win_and_then_nothing_is_to_be_printed_by_this_loop(p
         (
             (7.0, 2.5, 1.0),
             "flow error",
-            "square, material A, keeps 7.0 % of on‑off control’s flow error; 6 % are allowed.",
+            "square, material A, leaves 7.0 % of on‑off control’s flow error; 6 % are allowed.",
         ),
         (
             (2.0, 2.5, 4.0),

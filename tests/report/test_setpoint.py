@@ -296,7 +296,7 @@ def test_harm_stands_beside_recovery_in_minutes_and_who_may_not_run_last(project
     assert sum("may not run" in row for row in rows) == 1
     # 12 decisions of a wait of 6 s and 20 frames at 20 Hz; the deadline is 30 decisions
     assert "95 % back after 1.4 min (deadline 3.5 min)" in text
-    assert "parted into pools that share none" in text and "n_eff 2,100" in text
+    assert "divided into pools that share none" in text and "n_eff 2,100" in text
 
 
 def test_the_default_is_judged_though_another_is_better_and_says_who_may_not_run(project):
@@ -354,7 +354,7 @@ def test_right_is_told_by_flow_the_worst_bin_first(project):
         "It lies beside a border of the classes. Worst away from the borders: 70–75 % of flow, 90 % right"
     ) in text
     assert (
-        "Were every flow from 70 to 150 % as frequent: 82.5 % (80.1–84.9); the ideal reader 88.0 %." in text
+        "If every flow from 70 to 150 % were as frequent: 82.5 % (80.1–84.9); the ideal reader 88.0 %." in text
     )
     assert "every segment carries a width bias of 5 %" in text
     table = PAGE.read_text().split("tight by-flow")[1].split("</table>")[0]
