@@ -43,7 +43,7 @@ CODE = (
 class TrainAgent(Section):
     """Section `train_agent`, the agent of Li and Pattinson (2025) without the searched values: batch,
     transitions remembered, steps of an episode, Adam's rate, discount, the target network's step, updates of
-    each phase, exploration in the end, accuracy of the last phase, classes of its history."""
+    each phase, exploration in the end, accuracy of the last phase, classes of its history (eta)."""
 
     batch: int = Field(ge=1, le=100_000)
     capacity: int = Field(ge=1000, le=10_000_000)

@@ -96,13 +96,13 @@ def fitness(
     x0: np.ndarray,
     k=0.0,
 ) -> float:
-    """F = sum_{t=0..l} gamma^t (|y(t) - r|^2 + |u(t)|^2)
+    """Returns F (37) of u = -K_x x - K_r r - k with the state known and r constant.
 
-    of u = -K_x x - K_r r - k with the state known and r constant (37).
+        F = sum_{t=0..l} gamma^t (|y(t) - r|^2 + |u(t)|^2)
 
-    K_x (m, n), K_r (m, p), k (m,), reference r (p,) in °C, x0 (n,), steps = l >= 0: l + 1 terms. With
-    z = [x; 1] the loop is z(t+1) = M z(t), so that all z come from log2(l) products, Z <- [Z, M^i Z]. Raises
-    ValueError where the closed loop is unstable.
+    K_x (m, n), K_r (m, p), k (m,), reference r (p,) in °C, x0 (n,), steps = l >= 0: l + 1 terms. With z = [x;
+    1] the loop is z(t+1) = M z(t), so that all z come from log2(l) products, Z <- [Z, M^i Z]. Raises
+    ValueError if the closed loop is unstable.
     """
     A_cl = plant.A - plant.B @ K_x
     radius = np.abs(np.linalg.eigvals(A_cl)).max()

@@ -105,7 +105,7 @@ def differences(moves: Moves, extruded: Extruded, *, bead_area_mm2: float) -> li
 
 
 def resized(program: PartProgram, *, scale: float = 1.0, speed: float = 1.0) -> PartProgram:
-    """The program with X, Y and Z `scale` times as large and every feed `speed` times as fast."""
+    """Returns the program with X, Y and Z `scale` times as large and every feed `speed` times as fast."""
     moves = program.moves
     if scale == speed == 1.0:
         return program
