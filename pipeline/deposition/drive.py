@@ -6,12 +6,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-# of a limit: a command this near to it counts as at it, one this far beyond it as beyond
+# a command above the first share of a limit counts as at it, above the second as beyond it
 NEAR, BEYOND = 0.999, 1 + 1e-9
 
 
-# what a machine answers to: a pressure, given as a place whose standing still presses on; the speed of what
-# it pushes; or the place of it. The last two conserve volume
+# the quantity that a machine responds to: a pressure, given as a place that presses on even when it stands
+# still; the speed of what the machine pushes; or its place. The last two conserve volume
 CommandKind = Literal["pressure", "speed", "place"]
 
 

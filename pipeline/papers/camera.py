@@ -28,7 +28,7 @@ SEED, EPOCHS = 1, 8
 # segments of each class at each temperature, and pictures of each: 300 to learn from as in the paper
 LEARNED, HELD_OUT, JUDGED = (20, 15), (2, 15), (6, 40)
 WINDOWS = (5, 10, 20, 40)  # pictures
-# by which the tip is elsewhere than calibrated, at most, in either direction; the first is what is shown
+# by how much the tip is off its calibrated place, at most, in either direction; the first is the one shown
 SHAKES_PX = (5.0, 2.5, 10.0, 20.0)
 # other ways to take ADR, which the paper does not print: its crop along the bead only, and longer learning
 LONGER = 3 * EPOCHS

@@ -34,7 +34,7 @@ PRINTED_EFFORT = 1.5
 DELAYS_S = (0.0, 0.1, 0.15)
 # three time constants of B: plateaus of 6 s are too short to cut a library from
 ON_S = 14.0
-# share of the full speed from which flow a mm of travel is told: at rest there is none
+# share of the full speed from which flow per mm of travel is computed: at rest there is none
 MOVES = 0.05
 # the paper's machines A and B, its law (2), and the noise of a measured trial
 TS, AREA, SPEED, NOZZLE = 0.02, 0.304, 8.0, 0.6

@@ -36,13 +36,13 @@ STAGES = (probe_machine, ingest, identify_plant, learn_kernel, tune_weights, eva
 LENGTHS = (1500, 6000, 15000, 60000)
 DEFAULT = 6000
 RECORDS, PRIOR_RECORDS = 5, 3
-# what a relearning changes: everything that is drawn
+# seeds that change from one relearning to the next: those of all random numbers
 SEEDS = ("generate_probing.seed", "identify_plant.seed", "tune_weights.seed", "panel.training.seed",
          "panel.judging.seed")  # fmt: skip
 PRIORS: dict[str, dict[str, Any]] = {
     # tuned on the identified plant alone, and windows learned for no other gain than the record's
     "removed": {"panel.training.spread": 0.0, "learn_kernel.gain_spread": 0.0},
-    # half as much again as the panel, and windows learned for its whole spread of gains
+    # half as much again as the test set, and windows learned for its whole range of gains
     "added": {"panel.training.spread": 1.5, "learn_kernel.gain_spread": 0.0866},
 }
 

@@ -33,7 +33,7 @@ SEARCH: dict[str, tuple[Any, ...]] = {
     "rate_at_end": (1.0, 0.05),
 }
 LOOP = Path("pipeline/setpoint")
-# the code that decides what an agent comes to, which sees no recorded window
+# the code that decides the results of an agent; it sees no recorded window
 CODE = (
     "agents/agent.py", "agents/criteria.py", "agents/score.py", "agents/trials.py", "simulation/simulator.py",
     "simulation/actuation.py", "published.py",
@@ -102,7 +102,7 @@ def searched_run(settings: TrainAgent, chosen: dict[str, Any], seed: int) -> Sea
     if entry.is_file():
         return SearchedRun(**artifacts.read_json(entry))
     how = training(settings, chosen)
-    # what phase 4 alone sees is the same for all, so that phases 1 to 3 are trained once
+    # settings that only phase 4 uses are the same here for all, so that phases 1 to 3 are trained once
     shared = how._replace(rate_at_end=1.0, explore=(*how.explore[:3], 1.0))
     train_state, key = third_phase(seed, shared)  # ty: ignore[invalid-argument-type]
     result = agent.published_phase(train_state, key, how, len(PHASES))

@@ -50,7 +50,7 @@ FLUCTUATES, AT_REST = 5.0, 0.1
 RHO = 0.7
 # the class right as often as the paper's, and always
 ASKED_TO_WAIT = {"wait": RHO, "sure": 1.0}
-# what the paper prints of single runs: in these of our draws it is looked for, within half a percent
+# the paper's figures of single runs, searched in this many random runs of ours, within half a percent
 DRAWS, NEAR = 4000, 0.005
 PRINTED_RUNS: dict[str, dict[str, float]] = {
     "figure_3": {"rests_at": 101.0},

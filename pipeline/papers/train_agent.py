@@ -25,7 +25,7 @@ from pipeline.store import artifacts, params
 from pipeline.store.pins import check_pins
 
 FOLDER = Path("datasets/papers/train_agent")
-# of the runs that choose between the agent that was trained and the one that lies there
+# seed of the runs that choose between the trained and the stored agent
 VALIDATED_SEED = 20
 # points of a learning curve that a page has room for, of each phase
 POINTS = 50

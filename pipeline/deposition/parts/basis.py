@@ -15,15 +15,15 @@ from pipeline.deposition.parts.chain import IdentifiedExtruder, fronts
 # the yield is loaded this long before the flow begins and kept through gaps of twice that: long against the
 # lag, short against a pause between lines
 LOAD_S = 0.25
-# or, where the drive cannot follow that, over so many times as long: below the yield nothing flows
+# or, if the drive cannot follow that, over this many times as long: below the yield nothing flows
 LOADS = (1, 2, 4, 8)
 # dither: slow enough to pass a lag of a few Hz, fast enough that a time constant of
 # seconds leaves some 0.1 % of the steady flow of it
 DITHER_HZ = 2.5
 # and it fades over some cycles: a play left off its middle by a stop would offset the next start
 DITHER_S = 1.0
-# inverse of delay and lag: what lies beyond these seconds is nothing, and where the lag leaves less than
-# FLOOR of the power it is not undone
+# the inverse of delay and lag is cut beyond these seconds, and frequencies at which the lag passes less than
+# FLOOR of the power are not inverted
 SPAN_S, FLOOR = 2.0, 1e-3
 
 

@@ -165,7 +165,7 @@ def program(found: Legs, *, letter: str = "E", goes_on: bool = False) -> Iterato
         if not any(step):
             wait += seconds
             continue
-        # with X, Y or Z the feed is that of the path, else that of the plunger
+        # with X, Y or Z the feed is that of the path, without them that of the plunger
         way = math.hypot(*step[:3]) or abs(step[3])
         words = [f"{c}{x:.9g}" for c, x, d in zip(("X", "Y", "Z", letter), to, step, strict=True) if d]
         yield from (*_waited(wait), f"G1 {' '.join(words)} F{60 * way / seconds:.6g}")

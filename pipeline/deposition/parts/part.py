@@ -20,9 +20,9 @@ from pipeline.deposition.toolpath import gcode, motion
 from pipeline.deposition.toolpath.gcode import Kind, Moves, PartProgram
 from pipeline.deposition.toolpath.motion import Motion
 
-# a part's ramps grow by this factor until the drive follows, from a first one of so many seconds
+# a part's ramps grow by this factor until the drive follows, starting at this many seconds
 LONGER, FIRST_S = 1.2, 0.1
-# judged on as much of each tool's printing, so that a long job costs no more than a short one
+# only this much of each tool's printing is judged, so that a long job costs no more than a short one
 JUDGED_S = 300.0
 # ramps longer than this are no ramps of a printed line
 LONGEST_RAMP_S = 10.0
@@ -73,7 +73,7 @@ def compose(
     area, moves = settings.bead_area_mm2, program.moves
     planned, _ = plan_part(moves, gantry, settings, learned, materials, longest_ramp_s)
     check_duration(moves, planned)
-    # a printed line is as long as the declared bead would be of the volume that E asks for
+    # each printed line is made as long as a declared bead of its volume by E
     beads = extrusion.as_lengths(program, extruded, bead_area_mm2=area)
     composed = composition.compose(learned, beads, planned, settings, materials=materials)
     report = conformance.conform(
