@@ -106,7 +106,7 @@ def result(reproduced: Reproduced) -> dict[str, Any]:
 
 
 def plain(value: Any, digits: int = 17) -> Any:
-    """Returns a value for JSON, a number with so many digits; None for infinity and NaN."""
+    """Returns a value for JSON, a number with `digits` significant digits; None for infinity and NaN."""
     if hasattr(value, "_asdict"):
         value = value._asdict()
     if isinstance(value, Mapping):

@@ -66,12 +66,11 @@ class Bead(NamedTuple):
     """The bead in one frame. columns (n,) are the centres of blocks of 8 columns; widths (n,), top (n,) and
     bottom (n,) in px across the line, pixel centres at whole rows.
 
-    widths is 0 where the block shows background only and NaN where it cannot be read. `width` is the line
-    fitted robustly through the widths, at the middle of the blocks that it uses, and `deviation` its standard
-    deviation; both NaN where `reason` is not empty: "no bead", "saturated", "cut by the frame", "blurred",
-    "faint", "ragged".
-    `angle_deg` is the line's direction against the rows, `blur_px` the standard deviation of the edge,
-    `contrast` bead less background in levels.
+    widths is 0 if the block shows background only and NaN if it cannot be read. `width` is the line fitted
+    robustly through the widths, at the middle of the blocks that it uses, and `deviation` its standard
+    deviation. Both are NaN if `reason` is not empty: "no bead", "saturated", "cut by the frame", "blurred",
+    "faint", "ragged". `angle_deg` is the line's direction against the rows, `blur_px` the standard deviation
+    of the edge, `contrast` bead less background in levels.
     """
 
     columns: np.ndarray

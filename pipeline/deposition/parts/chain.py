@@ -70,9 +70,9 @@ class Chain(NamedTuple):
     `residual_percent`: r.m.s. of measured minus simulated flow over all trials; `held_out_percent`: r.m.s.
     error on learned trials of routines that the fit did not see, of means over AVERAGE_S; both in % of the
     steady flow. `structure`: the effects that were kept in addition to gain, time constant, delay, play and
-    yield. `left_out`: the fits without one routine each (without one trial each if there is only one
-    routine), in their order; `members`: the fits that the trials cannot tell from the best. `trials`: number
-    of trials used; `rows`: number of rows (`records`).
+    yield. `left_out`: the fits without one routine each (without one row each if there is only one routine),
+    in their order; `members`: the fits that the trials cannot tell from the best. `trials`: number of trials
+    used; `rows`: number of rows (`records`).
     """
 
     extruder: IdentifiedExtruder

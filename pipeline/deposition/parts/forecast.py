@@ -63,8 +63,9 @@ class Missed(NamedTuple):
     measured, in shares of the local flow. Three sizes are in % of the error of the first trials, which are
     on-off control, each without the share of noise: `held_out_percent`, the whole error, most of it at
     `event`; `change_percent`, the change of the level from the mean of the trials to the last of the next
-    PRINTS; `ripple_percent`, the ripple that differs from trial to trial. They are NaN if fewer than three
-    trials with learned commands do not show the noise. `level_percent` is the change in % of the flow."""
+    PRINTS; `ripple_percent`, the ripple that differs from trial to trial. `level_percent` is the change in %
+    of the flow. Error and change are NaN if there are fewer than three trials with learned commands, because
+    these do not show the noise."""
 
     by_place: np.ndarray
     held_out_percent: float
