@@ -12,14 +12,15 @@ import scipy.signal
 from pipeline.deposition.drive import Drive
 from pipeline.deposition.extruder import Extruder, ramp_of_gantry
 
-# a drive follows where it adds at most this share of on-off control's error to that of the unlimited command
+# a drive follows if it adds at most this share of on-off control's error to that of the unlimited command
 LOSS = 0.02
-# a longer signal is solved in pieces, each as far as MARGIN beyond its end, where what follows no longer
-# counts; where the limits hold the next piece otherwise by more than JOINED, in the unit of x or as a share
-# of the most, the margin doubles, up to a PIECE
+# a longer signal is solved in pieces, each with MARGIN samples beyond its end, after which later samples have
+# no effect. If the limits act on the next piece differently by more than JOINED, in the unit of x or as a
+# share of the largest, the margin doubles, up to a PIECE
 PIECE, MARGIN, JOINED = 8192, 512, 0.02
-# of the interior-point method on a piece: mean product of slack and multiplier at its begin and end, the
-# share of it that a step aims at, and of the way to the nearest bound that it goes
+# settings of the interior-point method on a piece: mean product of slack and multiplier at the begin and at
+# the end, the share of it at which a step aims, the share of the way to the nearest bound that a step goes,
+# and the largest number of steps
 FIRST_GAP, LAST_GAP, AIM, MOST_OF_WAY, MOST_STEPS = 30.0, 1e-6, 0.2, 0.99, 100
 
 
@@ -195,7 +196,7 @@ def _piece(
     Interior-Point Methods). It needs half the iterations of the barrier method, each O(N) too.
     """
     most = np.array([[1 / bound], [1 / step]])  # a limit that there is not: 0
-    # it sets out within the limits: the command goes to 0 at half of the speed
+    # the start is within the limits: the command goes to 0 at half of the speed
     slow = min(step / 2, abs(v))
     command = math.copysign(1.0, v) * np.maximum(abs(v) - slow * np.arange(1, len(s) + 1), 0.0)
     z = scipy.signal.lfilter([1.0], [1.0, -pole], command, zi=[pole * x])[0]

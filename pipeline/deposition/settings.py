@@ -1,7 +1,8 @@
 """Sections of the parameters that several stages of the deposition loop read: its machine with materials, its
 camera, the laws that learn from trials, and how a part is composed.
 
-Methods take values, no sections: the properties here make what a method takes, and import it only then.
+Methods take values, not sections. The properties here make the values that a method takes, and import the
+method's module only then.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
 
 
 class PrinterMaterial(Section):
-    """What is known of a material before anything is learned: K / (tau s + 1) from the command to flow, on
-    the printer's nozzle: mm^3/s per mm, or per mm/s of what is pushed."""
+    """A material as known before anything is learned: K / (tau s + 1) from the command to flow on the
+    printer's nozzle, with K in mm^3/s per mm, or per mm/s of what is pushed."""
 
     name: str = Field(min_length=1, max_length=40, pattern=r"^[A-Za-z0-9_-]+$")
     tool: int = Field(ge=0, le=99)
@@ -51,8 +52,8 @@ class TrainingRoutine(Section):
 
 
 class PlungerDrive(Section):
-    """What the plunger's drive can do: largest |command| (a way: its whole travel, where printer.command is a
-    speed or a place), largest speed, and backlash."""
+    """The limits of the plunger's drive: largest |command| (its whole travel, if printer.command is a speed
+    or a place), largest speed, and backlash."""
 
     amplitude_mm: float = Field(gt=0, le=1e6)
     speed_mm_per_s: float = Field(gt=0, le=1e6)
@@ -95,7 +96,7 @@ class Printer(Section):
 
     @property
     def kind(self) -> Literal["pressure", "speed", "place"]:
-        """What the machine answers to; a pressure if `command` is left out."""
+        """The quantity that the machine responds to; a pressure if `command` is left out."""
         return self.command or "pressure"
 
     @pydantic.model_validator(mode="after")
@@ -141,8 +142,9 @@ class Printer(Section):
         }
 
     def training_routines(self) -> list[Routine]:
-        """The training routines: the reference, on which laws are compared, and those of the library. If the
-        drive needs longer ramps of the gantry, it rests as long in the pause, between them."""
+        """Returns the training routines: the reference, on which laws are compared, and those of the library.
+        If the drive needs longer ramps of the gantry, the pause is longer by the same time, so that the rest
+        between the ramps is as long as before."""
         from pipeline.deposition import reachable
         from pipeline.deposition.extruder import routine
 
@@ -177,7 +179,7 @@ class Printer(Section):
 
 class TrialTopics(Section):
     """Topics of a machine's own recordings of trials: the camera's (empty: the only one), the clock
-    (log_time, publish_time, or a stamp's field), and the mapping of our signals."""
+    (log_time, publish_time, or a field of a stamp), and the mapping of our signals."""
 
     image: str = Field(max_length=300)
     time: str = Field(max_length=300)
@@ -188,12 +190,12 @@ Pixel = Annotated[float, Field(ge=-100_000, le=100_000)]
 
 
 class Camera(Section):
-    """Section `camera`: where it looks, how it was calibrated, and,
-    for simulated trials, how hard the pictures are.
+    """Section `camera`: where it looks, how it was calibrated, and, for simulated trials, how hard the
+    pictures are.
 
-    A picture is turned by rotation_deg, so that this direction of it runs along the columns, and put with
-    tip_px upon nozzle_column, before it is measured. edge_bias_px is by how much beads of known_widths_mm
-    look wider than they are.
+    Before it is measured, a picture is turned by rotation_deg, so that this direction of it runs along the
+    columns, and shifted so that tip_px lies on nozzle_column. edge_bias_px is by how much beads of
+    known_widths_mm look wider than they are.
     """
 
     frames_per_s: float = Field(gt=0, le=1000)
@@ -241,7 +243,7 @@ class Camera(Section):
 
     @property
     def mounting(self) -> Mounting:
-        """How the camera hangs, and what of its pictures is measured."""
+        """How the camera is mounted, and which part of its pictures is measured."""
         from pipeline.deposition.camera.line import Mounting
 
         known_px = [known / abs(self.mm_per_px) for known in self.known_widths_mm]
@@ -253,7 +255,7 @@ class Camera(Section):
         )  # fmt: skip
 
     def film(self, printer: Printer) -> dict[str, Any]:
-        """How a simulated trial is filmed: keywords of `rendering.simulate_trial`."""
+        """Returns how a simulated trial is filmed: keywords of `rendering.simulate_trial`."""
         from pipeline.deposition.camera.flow import View
 
         return {
@@ -278,7 +280,8 @@ class Camera(Section):
         return self.model_dump(include=names)
 
     def straight(self) -> Camera:
-        """The camera of a simulated machine, which stands straight and errs as its calibration finds."""
+        """Returns the camera of a simulated machine. It is mounted straight, and its width errors are those
+        that its own calibration finds."""
         return self.model_copy(
             update={
                 "rotation_deg": 0.0, "tip_px": None, "mask_px": [], "bead": "", "edge_bias_px": [],
@@ -291,8 +294,8 @@ def trial_conditions(
     printer: Printer, camera: Camera, material: PrinterMaterial, routine: Routine, trial: int, law: str,
     calibration: tuple[float, float],
 ) -> dict[str, Any]:  # fmt: skip
-    """What the recording of a trial says of itself: fields of `trial_files.TrialConditions`. calibration is
-    (gain, offset) of widths in mm against px."""
+    """Returns the conditions stored with the recording of a trial: fields of `trial_files.TrialConditions`.
+    calibration is (gain, offset) of widths in mm against px."""
     gain, offset = calibration
     return {
         "material": material.name,
@@ -310,8 +313,8 @@ def trial_conditions(
 
 
 class TrialNoise(Section):
-    """What does not repeat from trial to trial: white noise and drift in percent of the
-    steady flow, the gain of a whole trial in percent."""
+    """Disturbances that do not repeat from trial to trial: white noise and drift in percent of the steady
+    flow, the gain of a whole trial in percent."""
 
     white_percent: float = Field(ge=0, le=100)
     drift_percent: float = Field(ge=0, le=100)
@@ -328,7 +331,7 @@ class Hoelzle2009(Section):
 
 
 class ModelInverse(Section):
-    """The inverse of the model that the first trials identify."""
+    """Settings of the law by the inverse of the model that the first trials identify."""
 
     identify_trials: int = Field(ge=1, le=100)
     floor: float = Field(gt=0, le=1)
@@ -351,7 +354,7 @@ class TrainIlc(Section):
     model_inverse: ModelInverse
 
     def laws(self, printer: Printer) -> LawSettings:
-        """Settings of both laws on this printer."""
+        """Returns the settings of both laws on this printer."""
         from pipeline.deposition.learning.ilc import HoelzleSettings, InverseSettings
         from pipeline.deposition.learning.training import LawSettings
 
@@ -362,7 +365,7 @@ class TrainIlc(Section):
 
     @property
     def shares(self) -> Noise:
-        """What does not repeat from trial to trial, as shares of the steady flow."""
+        """Disturbances that do not repeat from trial to trial, as shares of the steady flow."""
         from pipeline.deposition.learning.training import Noise
 
         noise = self.noise
@@ -380,7 +383,7 @@ class ComposeParts(Section):
     full_part_updates: int = Field(ge=1, le=1000)
 
     def of_part(self, printer: Printer) -> PartSettings:
-        """How a part is printed on this printer."""
+        """Returns how a part is printed on this printer."""
         from pipeline.deposition.parts.composition import PartSettings
 
         return PartSettings(

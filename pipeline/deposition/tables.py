@@ -1,6 +1,6 @@
 """The tables of the deposition loop's stages: columns with type, unit, meaning and range, and a version.
 
-Other columns are another version: raise the number with them.
+If the columns change, raise the version number.
 """
 
 from pipeline.deposition.controllers import COMPOSERS

@@ -1,10 +1,10 @@
-"""What Li and Pattinson (2025) say of their camera, tried on rendered pictures: the hard mask against the
-whole crop, ADR against none, and windows of several lengths (sections 2.2 and 2.4).
+"""Tests on rendered pictures what Li and Pattinson (2025) say about their camera: the hard mask against the
+whole crop, ADR against no ADR, and windows of several lengths (sections 2.2 and 2.4).
 
-`./run dvc repro datasets/papers/dvc.yaml:camera` writes datasets/papers/camera.json; minutes. One small
-network with the paper's patches learns 4,500 pictures as the paper deals them: 300 of each of three classes
-at five temperatures. Without the mask it sees the whole crop, 350 x 350 px, equalised and resized to its 48 x
-16 px.
+`./run dvc repro datasets/papers/dvc.yaml:camera` writes datasets/papers/camera.json; it takes minutes. One
+small network with the paper's patches learns from 4,500 pictures, divided as in the paper: 300 of each of
+three classes at five temperatures. Without the mask it gets the whole crop, 350 x 350 px, equalised and
+resized to its 48 x 16 px.
 """
 
 import itertools
@@ -28,7 +28,7 @@ SEED, EPOCHS = 1, 8
 # segments of each class at each temperature, and pictures of each: 300 to learn from as in the paper
 LEARNED, HELD_OUT, JUDGED = (20, 15), (2, 15), (6, 40)
 WINDOWS = (5, 10, 20, 40)  # pictures
-# by which the tip is elsewhere than calibrated, at most, in either direction; the first is what is shown
+# by how much the tip is off its calibrated place, at most, in either direction; the first is the one shown
 SHAKES_PX = (5.0, 2.5, 10.0, 20.0)
 # other ways to take ADR, which the paper does not print: its crop along the bead only, and longer learning
 LONGER = 3 * EPOCHS
@@ -37,9 +37,8 @@ TRAINING = TrainingSettings(EPOCHS, 1.0, 64, 0.002, 0.01, 0.0, 0.99, EPOCHS)
 
 
 class Filmed(NamedTuple):
-    """n pictures in which a line is found: its key areas and the whole crops (n, 16, 48) uint8, the key areas
-    of a tip that is shaken (n, shakes, 16, 48); then temperature, class, flow and segment as Labelled has
-    them."""
+    """n pictures in which a line is found: the key areas and the whole crops (n, 16, 48) uint8; the key areas
+    for a shaken tip (n, shakes, 16, 48); then temperature, class, flow and segment as in Labelled."""
 
     key_area: np.ndarray
     whole: np.ndarray
@@ -54,8 +53,8 @@ class Filmed(NamedTuple):
 
 
 def film(rng: np.random.Generator, segments: int, frames: int, first: int) -> Filmed:
-    """`frames` pictures of so many segments of each class at each temperature, segments numbered from
-    first."""
+    """Renders `frames` pictures of each segment, with `segments` segments of each class at each temperature,
+    numbered from `first`."""
     pieces: list[tuple[np.ndarray, ...]] = []
     for kind in range(len(classifier.CLASS_NAMES)):
         for degrees in nozzle_scene.TEMPERATURES:
@@ -82,14 +81,14 @@ def film(rng: np.random.Generator, segments: int, frames: int, first: int) -> Fi
 
 
 def whole_crops(frames: np.ndarray) -> np.ndarray:
-    """Frames (n, 350, 350), equalised, in as many pixels as a key area has (n, 16, 48)."""
+    """Returns frames (n, 350, 350), equalised, resized to the pixels of a key area (n, 16, 48)."""
     size = SHAPE[::-1]
     return np.array([cv2.resize(cv2.equalizeHist(a), size, interpolation=cv2.INTER_AREA) for a in frames])
 
 
 def learned(parts: Sequence[Filmed], name: str, augment: Callable, epochs: int = EPOCHS) -> Classifier:
-    """The network that learns what `name` of the first of these parts shows, with this augmentation; its
-    epoch is chosen by the second."""
+    """Returns the network trained on the pictures `name` of the first part, with this augmentation. Its epoch
+    is chosen by the second part."""
     network = vision_transformer(NETWORK, np.random.default_rng(SEED))
     state = classifier.untrained(network, epochs=epochs)
     seen, settings = (
@@ -100,15 +99,16 @@ def learned(parts: Sequence[Filmed], name: str, augment: Callable, epochs: int =
 
 
 def unchanged(key: jax.Array, x: jax.Array) -> jax.Array:
-    """The pictures as they are: no ADR."""
+    """Returns the pictures as they are: no ADR."""
     return x
 
 
 def robustness(parts: Sequence[Filmed], networks: Mapping[str, Classifier]) -> dict[str, Any]:
-    """ADR against none in the ways that the paper leaves open: crop of both sides or along the bead, 8 or 24
-    epochs, and by how much the nozzle shakes: percent right of shaken pictures, a row a way, and twice the
-    standard error of what ADR gains, over segments. The ways in which it gains more than that, and the one in
-    which it gains most. `networks` are those of 8 epochs without ADR, "mask", and with it, "mask_adr"."""
+    """Compares ADR with no ADR in the ways that the paper leaves open: crop of both sides or along the bead,
+    8 or 24 epochs, and how far the nozzle shakes. Returns a row per way with the percentage of shaken
+    pictures that are right, and twice the standard error of ADR's gain, over segments. Also returns the
+    number of ways in which ADR gains more than that error, and the way with the largest gain. `networks` are
+    those of 8 epochs without ADR, "mask", and with it, "mask_adr"."""
     judged, rows = parts[2], []
     ways = {"both sides": classifier.adr, "along the bead": classifier.along_bead}
     known = {(EPOCHS, "none"): networks["mask"], (EPOCHS, "both sides"): networks["mask_adr"]}
@@ -137,20 +137,20 @@ def robustness(parts: Sequence[Filmed], networks: Mapping[str, Classifier]) -> d
 
 
 def named(network: Classifier, seen: Labelled) -> np.ndarray:
-    """The class (n,) of each picture."""
+    """Returns the predicted class (n,) of each picture."""
     ask = jax.jit(lambda images, degrees: jnp.argmax(network(images, degrees), axis=1))
     parts = np.array_split(np.arange(len(seen.label)), max(len(seen.label) // 500, 1))
     return np.concatenate([np.asarray(ask(*(a[rows] for a in seen[:2]))) for rows in parts])
 
 
 def right(network: Classifier, seen: Labelled) -> float:
-    """Percent of the pictures whose class is named rightly."""
+    """Returns the percentage of the pictures that are classified correctly."""
     return 100.0 * float(np.mean(named(network, seen) == seen.label))
 
 
 def right_windows(names: np.ndarray, seen: Labelled, length: int) -> float:
-    """Percent of the windows of so many pictures in a row of one segment in which the most frequent class,
-    the largest of (4), is the true one."""
+    """Returns the percentage of correct windows. A window is `length` successive pictures of one segment; it
+    is correct if the most frequent class, the largest of (4), is the true one."""
     hits = []
     for segment in np.unique(seen.segment):
         rows = np.flatnonzero(seen.segment == segment)

@@ -1,10 +1,10 @@
-"""Hoelzle, Alleyne and Wagoner Johnson 2009 beside us: every figure of the paper on its own nominal machine,
-and the same law on a machine that is not its model.
+"""Reproduces Hoelzle, Alleyne and Wagoner Johnson 2009: every figure of the paper on its own nominal machine,
+and the same law on a machine that differs from its model.
 
 `./run dvc repro datasets/papers/dvc.yaml:deposition` writes datasets/papers/deposition.json, which
-reports/papers.html shows; half a minute. The paper prints neither lengths nor speeds of its training routine:
-ours is a pulse of two plateaus with a pause of 0.6 s between them, at 50 Hz, one for all figures. Errors are
-in its unit, measured flow a mm of travel, while the gantry moves.
+reports/papers.html shows; it takes half a minute. The paper gives neither lengths nor speeds of its training
+routine. Ours is a pulse of two plateaus with a pause of 0.6 s between them, at 50 Hz, one for all figures.
+Errors are in the paper's unit, measured flow per mm of travel, while the gantry moves.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ PRINTED_EFFORT = 1.5
 DELAYS_S = (0.0, 0.1, 0.15)
 # three time constants of B: plateaus of 6 s are too short to cut a library from
 ON_S = 14.0
-# share of the full speed from which flow a mm of travel is told: at rest there is none
+# share of the full speed from which flow per mm of travel is computed: at rest there is none
 MOVES = 0.05
 # the paper's machines A and B, its law (2), and the noise of a measured trial
 TS, AREA, SPEED, NOZZLE = 0.02, 0.304, 8.0, 0.6
@@ -65,8 +65,8 @@ ALLOWED = {
 
 
 def forbidden(tasks: Sequence[str] | np.ndarray, tools: Sequence[int] | np.ndarray) -> np.ndarray:
-    """The indices (F,) of tasks that may not follow the one before them (figure 8): another tool comes only
-    by Dwell, Steady-State never goes to No-Flow."""
+    """Returns the indices (F,) of tasks that may not follow the one before them (figure 8): another tool
+    comes only after Dwell, Steady-State never goes to No-Flow."""
     task, tool = np.asarray(tasks), np.asarray(tools)
     names = np.array(list(ALLOWED))
     table = np.array([[after in ALLOWED[before] for after in names] for before in names])
@@ -77,19 +77,19 @@ def forbidden(tasks: Sequence[str] | np.ndarray, tools: Sequence[int] | np.ndarr
 
 
 def percent(plant: Extruder, nominal: Extruder, u: np.ndarray, r: np.ndarray) -> float:
-    """R.m.s. error of the true flow under u in percent of on-off control's."""
+    """Returns the r.m.s. error of the true flow with u in percent of on-off control's."""
     on_off = flow(plant, r / nominal.gain, sample_time_s=TS) - r
     return 100 * float(np.linalg.norm(flow(plant, u, sample_time_s=TS) - r) / np.linalg.norm(on_off))
 
 
 def causal_q(x: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
-    """Q x (T,) run forward only: the other reading of the paper's Q, which delays the command and never gets
-    below a third of the error."""
+    """Returns Q x (T,) run forward only. This is the other reading of the paper's Q: it delays the command,
+    and the error never falls below a third."""
     return scipy.signal.sosfilt(scipy.signal.butter(order, cutoff_hz, fs=1 / sample_time_s, output="sos"), x)
 
 
 def trained(ramp_s: float = RAMP_S) -> Routine:
-    """The training routine: off, on, pause, on, off; ramps of more than RAMP_S make it longer."""
+    """Returns the training routine: off, on, pause, on, off. Ramps of more than RAMP_S make it longer."""
     more = ramp_s - RAMP_S
     return routine(
         off_s=4 + more, on_s=ON_S + 2 * more, pause_s=PAUSE_S, tail_s=8 + more, speed=SPEED,
@@ -100,7 +100,8 @@ def trained(ramp_s: float = RAMP_S) -> Routine:
 def learned(
     plant: Extruder, nominal: Extruder, r: np.ndarray, q=ilc.zero_phase, trials: int = TRIALS
 ) -> list[ilc.Trial]:
-    """So many updates of the paper's law (2) from on-off control, the drive without limits, no roll-back."""
+    """Runs `trials` updates of the paper's law (2) from on-off control, with an unlimited drive and without
+    roll-back."""
     rng = np.random.default_rng(0)
     law = ilc.hoelzle_law(r, nominal, q, HOELZLE, drive=UNLIMITED, sample_time_s=TS)
 
@@ -112,7 +113,7 @@ def learned(
 
 
 def ratios(trials: list[ilc.Trial], task: Routine) -> list[float]:
-    """R.m.s. error of the measured flow in mm³ a mm of travel, in percent of trial 0's."""
+    """Returns the r.m.s. errors of the measured flow in mm³ per mm of travel, in percent of trial 0's."""
     moves = task.speed > MOVES * task.speed.max()
     errors = [
         float(np.sqrt(np.mean(((trial.y - task.r)[moves] / task.speed[moves]) ** 2))) for trial in trials
@@ -121,13 +122,13 @@ def ratios(trials: list[ilc.Trial], task: Routine) -> list[float]:
 
 
 def thinned(x: np.ndarray, every: int = 5, digits: int = 4) -> list[float]:
-    """A curve for a picture."""
+    """Returns every few samples of a curve, rounded, for a picture."""
     return [round(float(value), digits) for value in np.asarray(x, float)[::every]]
 
 
 def learning(task: Routine) -> dict[str, Any]:
-    """Figures 3 to 5: A and B on their nominal machines, A with delays that the model lacks, and with a Q
-    that runs forward only."""
+    """Returns figures 3 to 5: A and B on their nominal machines, A with delays that the model lacks, and with
+    a Q that runs forward only."""
     out: dict[str, Any] = {"time_s": thinned(task.time_s, digits=2), "wanted": thinned(task.r / STEADY_FLOW)}
     printing = task.r > 0
     for name, nominal in MATERIALS.items():
@@ -162,8 +163,9 @@ def learning(task: Routine) -> dict[str, Any]:
 
 
 def slower_ramps() -> dict[str, float]:
-    """The paper does not print its ramps. The first of RAMPS_S with which the r.m.s. command of B over that
-    of A while printing is what it prints, to a hundredth; that ratio, and the least errors with it."""
+    """Finds the first of RAMPS_S with which the r.m.s. command of B over that of A while printing equals the
+    published ratio to a hundredth, because the paper does not give its ramps. Returns the ramp, that ratio,
+    and the least errors with it. Raises RuntimeError if no ramp does."""
     for ramp_s in RAMPS_S:
         task = trained(float(ramp_s))
         trials = {name: learned(one, one, task.r) for name, one in MATERIALS.items()}
@@ -176,7 +178,8 @@ def slower_ramps() -> dict[str, float]:
 
 
 def convergence(delay_s: float) -> float:
-    """max |Q (1 - L P)| of the law for material A on a machine that is `delay_s` later than its model."""
+    """Returns max |Q (1 - L P)| of the law for material A on a machine that is `delay_s` later than its
+    model."""
     f, nominal = np.linspace(0.0, 24.9, 4000), MATERIALS["A"]
     Q = ilc.magnitude(f, sample_time_s=TS, **HOELZLE_Q) ** 2
     L = ilc.hoelzle_filter(f, nominal, HOELZLE, sample_time_s=TS)
@@ -185,7 +188,7 @@ def convergence(delay_s: float) -> float:
 
 
 def library(task: Routine) -> tuple[LearnedLibrary, dict[str, Any]]:
-    """Figure 6 and matrix (3): the commands of the last trials of A and B, cut into basis signals."""
+    """Returns figure 6 and matrix (3): the commands of the last trials of A and B, cut into basis signals."""
     trainings = []
     for name, nominal in MATERIALS.items():
         trials = learned(nominal, nominal, task.r)
@@ -221,8 +224,8 @@ def library(task: Routine) -> tuple[LearnedLibrary, dict[str, Any]]:
 
 
 def composed(known: LearnedLibrary, path: Path, tools: dict[int, str], *, curves: bool) -> dict[str, Any]:
-    """One part by the paper's rule of priority: its tasks, their commands, and the error of the true flow in
-    percent of on-off control, on the nominal machines."""
+    """Returns one part by the paper's priority rule: its tasks, their commands, and the error of the true
+    flow in percent of on-off control, on the nominal machines."""
     program = parse(path.read_text())
     made = compose(known, program, plan(program.moves, **MACHINE), PART, materials=tools)
     tasks = made.tasks
@@ -255,7 +258,7 @@ def composed(known: LearnedLibrary, path: Path, tools: dict[int, str], *, curves
 
 
 def drawn(program: PartProgram) -> list[dict[str, Any]]:
-    """Each printed move as a line of points in mm, with its tool: figure 12."""
+    """Returns each printed move as a line of points in mm, with its tool: figure 12."""
     moves, rows = program.moves, []
     for k in np.flatnonzero((moves.kind == Kind.EXTRUDE) & (moves.length > 0)):
         start, end = moves.start[k, :2], moves.end[k, :2]
@@ -276,7 +279,7 @@ def drawn(program: PartProgram) -> list[dict[str, Any]]:
 
 
 def table_1() -> dict[str, Any]:
-    """What table I and (2) list, as it was used here."""
+    """Returns the values of table I and (2), as used here."""
     return {
         "gain": [nominal.gain for nominal in MATERIALS.values()],
         "time_constant_s": [nominal.time_constant_s for nominal in MATERIALS.values()],

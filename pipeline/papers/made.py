@@ -1,10 +1,11 @@
-"""What the files of the second pipeline, datasets/papers/dvc.yaml, were made of: made.json holds for each
-stage the commit, and the SHA-256 of every dependency and parameter that its entry in dvc.yaml names. Of code
-it is that of the syntax tree without imports and docstrings: a method that only moved is the same method.
+"""Records what the files of the second pipeline, datasets/papers/dvc.yaml, were made from. made.json has for
+each stage the commit, and the SHA-256 of every dependency and parameter that its entry in dvc.yaml names. For
+code this is the SHA-256 of the syntax tree without imports and docstrings, so a method that only moved is the
+same method.
 
-The root's pipeline starts none of these stages and a change of a method makes none of their files anew, so a
-page says which of them are older than their method. It is a function of files in git alone: every clone says
-the same.
+The root's pipeline starts none of these stages, and a change of a method does not make their files again. So
+a page says which of the files are older than their method. This depends only on files in git, so every clone
+says the same.
 """
 
 import ast
@@ -24,7 +25,7 @@ NAMED = 3
 
 
 def stages() -> list[str]:
-    """The stages of the second pipeline, in its order."""
+    """Returns the stages of the second pipeline, in its order."""
     return list(params.files(PIPELINE)[str(PIPELINE)]["stages"])
 
 
@@ -36,7 +37,7 @@ def record(stage: str) -> None:
 
 
 def names(stage: str) -> list[str]:
-    """What its entry in dvc.yaml names: files, and sections of parameters as "file: section"."""
+    """Returns what its entry in dvc.yaml names: files, and sections of parameters as "file: section"."""
     entry = params.files(PIPELINE)[str(PIPELINE)]["stages"][stage]
     sections = []
     for item in entry.get("params", []):
@@ -46,13 +47,13 @@ def names(stage: str) -> list[str]:
 
 
 def changed(stage: str) -> list[str]:
-    """Files and parameters that are not what the stage's file was made of. It reads no dvc.yaml, which DVC
-    allows no stage to depend on."""
+    """Returns the files and parameters that differ from those the stage's file was made from. It does not
+    read dvc.yaml, because DVC allows no stage to depend on that."""
     return sorted(name for name, then in _entry(stage).get("of", {}).items() if _sha256(name) != then)
 
 
 def sentence(stage: str) -> str:
-    """When the file of a stage was made, and whether its method has changed since."""
+    """Returns in words when the file of a stage was made, and whether its method has changed since."""
     entry = _entry(stage)
     if not entry:
         return f"Nothing says of which method it was made; run {command(stage)}."
@@ -64,7 +65,7 @@ def sentence(stage: str) -> str:
 
 
 def command(stage: str) -> str:
-    """What makes the file of a stage anew."""
+    """Returns the command that makes the file of a stage again."""
     return f"./run dvc repro {PIPELINE}:{stage}"
 
 
@@ -73,7 +74,7 @@ def _entry(stage: str) -> dict[str, Any]:
 
 
 def code_digest(source: str) -> str:
-    """The SHA-256 of the syntax tree of a module without its imports and docstrings."""
+    """Returns the SHA-256 of the syntax tree of a module without its imports and docstrings."""
     # CPython 3.11 counts the depth of all parses of a process in one place: a collection in the middle of one
     # lets another thread run, and a parse there makes this one fail ("recursion depth mismatch")
     gc.disable()
@@ -93,7 +94,8 @@ def code_digest(source: str) -> str:
 
 
 def _sha256(name: str) -> str:
-    """Of a file, or of a section of parameters as JSON; "" for what is not there."""
+    """Returns the SHA-256 of a file, or of a section of parameters as JSON; "" for a file that does not
+    exist."""
     path, _, key = name.partition(": ")
     if not Path(path).exists():
         return ""

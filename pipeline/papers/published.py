@@ -1,7 +1,6 @@
-"""What seed 1 prints and its script has: its constants and weights, its Algorithm 1 with the script's
-Lyapunov equation, and the windows with one reference. pipeline/papers/temperature.py counts its figures with
-them; the honest yardstick is scorecard.py.
-"""
+"""The published values of the temperature study and its script: constants and weights, its Algorithm 1 with
+the script's Lyapunov equation, and the windows with one reference. pipeline/papers/temperature.py computes
+the study's figures with them; the fair reference is scorecard.py."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -46,15 +45,15 @@ PRINTED = {
 
 
 def augmented(plant: Plant, Q: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """T, B_1 of (12) and Q_1 of (14) for the state [x; r]."""
+    """Returns T, B_1 of (12) and Q_1 of (14) for the state [x; r]."""
     CQ = plant.C.T @ Q
     T = scipy.linalg.block_diag(plant.A, F)
     return T, np.vstack([plant.B, np.zeros((plant.p, plant.m))]), np.block([[CQ @ plant.C, -CQ], [-CQ.T, Q]])
 
 
 class Iterated(NamedTuple):
-    """K (m, n+p) of u = -K [x; r] (15), and how many policies were evaluated; `settled`
-    is False where the limit of iterations ended it."""
+    """K (m, n+p) of u = -K [x; r] (15), and the number of policies evaluated. `settled` is False if the limit
+    of iterations ended it."""
 
     K: np.ndarray
     iterations: int
@@ -62,11 +61,11 @@ class Iterated(NamedTuple):
 
 
 def algorithm_1(plant: Plant, Q, R, gamma, K0, *, tolerance: float, max_iterations: int = 100) -> Iterated:
-    """Algorithm 1 as the study's script runs it: its Lyapunov equation carries gamma in place of sqrt(gamma),
+    """Runs Algorithm 1 as the study's script does: its Lyapunov equation has gamma in place of sqrt(gamma),
     and it stops on the one-norm of K's change.
 
-    From a K0 under which the cost is infinite, the P of (ii) is no cost, and the iteration can settle on a
-    gain that does not stabilise: nothing here notices.
+    If the cost is infinite with K0, the P of (ii) is no cost, and the iteration can settle on a gain that
+    does not stabilise. This is not detected here.
     """
     T, B_1, Q_1 = augmented(plant, Q, np.eye(plant.p))
     K = K0
@@ -79,15 +78,15 @@ def algorithm_1(plant: Plant, Q, R, gamma, K0, *, tolerance: float, max_iteratio
 
 
 def stabilises(plant: Plant, K_x: np.ndarray) -> bool:
-    """Whether every eigenvalue of A - B K_x lies inside the unit circle."""
+    """Returns whether every eigenvalue of A - B K_x lies inside the unit circle."""
     return bool(np.abs(np.linalg.eigvals(plant.A - plant.B @ K_x)).max() < 1)
 
 
 def tuples_with_reference(
     u: Sequence[np.ndarray], y: Sequence[np.ndarray], N: int, r: np.ndarray, F: np.ndarray
 ) -> Tuples:
-    """The published form: s = [past u; past y; r] with one reference r (p,), r(t+1) = F r, e = y - r. Its
-    kernel serves this reference only."""
+    """Returns the published form: s = [past u; past y; r] with one reference r (p,), r(t+1) = F r, e = y - r.
+    Its kernel is valid for this reference only."""
     plain = tuples(u, y, N)
     rows = (len(plain.s), 1)
     features = np.vstack(

@@ -36,19 +36,20 @@ STAGES = (probe_machine, ingest, identify_plant, learn_kernel, tune_weights, eva
 LENGTHS = (1500, 6000, 15000, 60000)
 DEFAULT = 6000
 RECORDS, PRIOR_RECORDS = 5, 3
-# what a relearning changes: everything that is drawn
+# seeds that change from one relearning to the next: those of all random numbers
 SEEDS = ("generate_probing.seed", "identify_plant.seed", "tune_weights.seed", "panel.training.seed",
          "panel.judging.seed")  # fmt: skip
 PRIORS: dict[str, dict[str, Any]] = {
     # tuned on the identified plant alone, and windows learned for no other gain than the record's
     "removed": {"panel.training.spread": 0.0, "learn_kernel.gain_spread": 0.0},
-    # half as much again as the panel, and windows learned for its whole spread of gains
+    # half as much again as the test set, and windows learned for its whole range of gains
     "added": {"panel.training.spread": 1.5, "learn_kernel.gain_spread": 0.0866},
 }
 
 
 def relearn(drawn: Mapping[str, int], changes: Mapping[str, Any]) -> dict:
-    """What one run of the stages comes to, in a folder of its own, with other seeds and other parameters."""
+    """Runs the stages once in a folder of its own, with other seeds and other parameters, and returns its
+    results. Raises ValueError if a stage fails."""
     root, began = Path.cwd(), time.process_time()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -86,8 +87,8 @@ def relearn(drawn: Mapping[str, int], changes: Mapping[str, Any]) -> dict:
 
 
 def mean_log_costs(cases: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """By contestant the mean over plants of the logarithm of a plant's mean cost, as the comparison counts
-    it; those whose cost is missing in a case are left out."""
+    """Returns for each controller the mean over plants of the logarithm of a plant's mean cost, as the
+    comparison computes it. Controllers whose cost is missing in a case are left out."""
     result = {}
     for name in dict.fromkeys(cases["contestant"].tolist()):
         own = cases["contestant"] == name
@@ -99,8 +100,8 @@ def mean_log_costs(cases: Mapping[str, np.ndarray]) -> dict[str, float]:
 
 
 def answers(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """How often each contestant was the best and won the pair, by how much, what each cost on each record
-    (nothing where it was refused), and the CPU time of all."""
+    """Returns how often each controller was the best and won the pair, by how much, the cost of each on each
+    record (none if it was refused), and the CPU time of all."""
 
     def counted(values: list) -> dict[str, int]:
         return {str(value): values.count(value) for value in dict.fromkeys(values)}
@@ -121,9 +122,9 @@ def answers(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def by_length(
     runs: Mapping[int, Sequence[Mapping[str, Any]]], names: Sequence[str], seed: int
 ) -> dict[str, Any]:
-    """The curve of cost against record length (`record_length.curves`, its bands over records) of the
-    controllers `names`, and the answers by length. A controller that was refused from one of a length's
-    records is missing at that length, with the reason."""
+    """Returns the curve of cost against record length (`record_length.curves`, its bands over records) of the
+    controllers `names`, and the answers by length. A controller that was refused on one of a length's records
+    is missing at that length, with the reason."""
     costs, refused = [], {}
     for length, own in runs.items():
         known = [name for name in names if all(name in run["costs"] for run in own)]
@@ -138,12 +139,12 @@ def by_length(
 
 
 def seeds(number: int) -> dict[str, int]:
-    """The seeds of one relearning; the plants to tune on are other plants than those to judge on."""
+    """Returns the seeds of one relearning. The plants for tuning differ from those for judging."""
     return dict.fromkeys(SEEDS, number) | {"panel.training.seed": 5000 + number}
 
 
 def many(count: int, first: int, changes: Mapping[str, Any], jobs: int) -> list[dict]:
-    """`count` relearnings, everything drawn anew from seeds that begin with `first`."""
+    """Runs `count` relearnings, each with new random numbers from seeds that begin with `first`."""
     changes = {"evaluate_temperature.cost_curve": False, **changes}
     work = [seeds(first + k) for k in range(count)]
     return joblib.Parallel(n_jobs=jobs)(joblib.delayed(relearn)(drawn, changes) for drawn in work)

@@ -1,8 +1,8 @@
-"""The study's own part, on its simulated machine, which no recording touches: datasets/published ->
-datasets/papers/reproduce_study.json.
+"""Reproduces the study's own part, on its simulated machine, which no recording changes: datasets/published
+-> datasets/papers/reproduce_study.json.
 
-Its learners on noise-free and on many noisy data sets, and the parity search, Q and R by Bayesian
-optimisation of its fitness (37), whose optimum is known.
+It has the study's learners on noise-free and on many noisy data sets, and the parity search: Q and R by
+Bayesian optimisation of its fitness (37), whose optimum is known.
 """
 
 import math
@@ -39,14 +39,14 @@ class ReproduceStudy(Section):
 
 
 class Reproduced(NamedTuple):
-    """A row a noisy data set and route, and the figures beside the paper's."""
+    """`study`: a row per noisy data set and route; `metrics`: the figures with the paper's."""
 
     study: dict[str, list]
     metrics: dict[str, Any]
 
 
 def check(settings: ReproduceStudy) -> None:
-    """Raises ValueError where the parity search has no room."""
+    """Raises ValueError if the bounds or numbers of the parity search leave no room."""
     for name in ("q", "r"):
         low, high = getattr(settings, f"{name}_low"), getattr(settings, f"{name}_high")
         if low >= high:
@@ -62,7 +62,7 @@ def check(settings: ReproduceStudy) -> None:
 
 
 def reproduced(settings: ReproduceStudy, execution: Execution, folder: str) -> Reproduced:
-    """`folder` has the draws behind the paper's figures."""
+    """Returns the study's part. `folder` has the random data behind the paper's figures."""
     _, u, y = read_published(folder)
     rows = _noisy(settings, execution)
     noise_free = study.noise_free(u[1:], y[1:], np.random.default_rng(settings.seed))
@@ -71,7 +71,7 @@ def reproduced(settings: ReproduceStudy, execution: Execution, folder: str) -> R
 
 
 def _noisy(settings: ReproduceStudy, execution: Execution) -> dict[str, list]:
-    """Gap and error of every route on every noisy data set."""
+    """Returns gap and error of every route on every noisy data set."""
     sets_u, sets_y = study.data_sets(np.random.default_rng(settings.seed), SAMPLES, settings.data_sets)
     work = [(noise, i) for noise in study.NOISE for i in range(settings.data_sets)]
     calls = [delayed(study.under_noise)(sets_u[:, i], sets_y[:, i], noise=noise, seed=i) for noise, i in work]
@@ -101,12 +101,12 @@ def _parity(settings: ReproduceStudy) -> tuning.SearchResult:
 
 
 def result(reproduced: Reproduced) -> dict[str, Any]:
-    """What the file holds: the figures, and the table as lists, eight digits a number."""
+    """Returns the contents of the file: the figures, and the table as lists, eight digits per number."""
     return {"figures": plain(reproduced.metrics), "study": plain(reproduced.study, digits=8)}
 
 
 def plain(value: Any, digits: int = 17) -> Any:
-    """A value as JSON has it, a number with so many digits; None for a number without end or that is none."""
+    """Returns a value for JSON, a number with `digits` significant digits; None for infinity and NaN."""
     if hasattr(value, "_asdict"):
         value = value._asdict()
     if isinstance(value, Mapping):

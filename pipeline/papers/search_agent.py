@@ -1,9 +1,10 @@
-"""What Li and Pattinson (2025) do not print of their fourth phase, searched: every setting of SEARCH from
-every seed of SEEDS, all four phases, of the fourth the best checkpoint.
+"""Searches the values that Li and Pattinson (2025) do not give for their fourth phase: every setting of
+SEARCH from every seed of SEEDS, all four phases, and the best checkpoint of the fourth.
 
 `./run dvc repro datasets/papers/dvc.yaml:search_agent` writes datasets/papers/search_agent.json, from which
-train_agent takes setting and seed; an hour. What the same code trained is in datasets/memo/search_agent.
-Validation runs alone choose checkpoint, setting and seed: the runs that an agent is judged by choose nothing.
+train_agent takes setting and seed; it takes an hour. Runs that the same code has trained are kept in
+datasets/memo/search_agent. Only validation runs choose checkpoint, setting and seed. The runs by which an
+agent is judged choose nothing.
 """
 
 import itertools
@@ -32,7 +33,7 @@ SEARCH: dict[str, tuple[Any, ...]] = {
     "rate_at_end": (1.0, 0.05),
 }
 LOOP = Path("pipeline/setpoint")
-# the code that decides what an agent comes to, which sees no recorded window
+# the code that decides the results of an agent; it sees no recorded window
 CODE = (
     "agents/agent.py", "agents/criteria.py", "agents/score.py", "agents/trials.py", "simulation/simulator.py",
     "simulation/actuation.py", "published.py",
@@ -40,9 +41,9 @@ CODE = (
 
 
 class TrainAgent(Section):
-    """Section `train_agent`, the agent of Li and Pattinson (2025) without what is searched: batch,
+    """Section `train_agent`, the agent of Li and Pattinson (2025) without the searched values: batch,
     transitions remembered, steps of an episode, Adam's rate, discount, the target network's step, updates of
-    each phase, exploration in the end, accuracy of the last phase, classes of its history, eta."""
+    each phase, exploration in the end, accuracy of the last phase, classes of its history (eta)."""
 
     batch: int = Field(ge=1, le=100_000)
     capacity: int = Field(ge=1000, le=10_000_000)
@@ -57,7 +58,7 @@ class TrainAgent(Section):
 
 
 def training(settings: TrainAgent, chosen: dict[str, Any]) -> agent.PublishedTraining:
-    """These settings with a choice of SEARCH, as the method takes them."""
+    """Returns these settings with a choice of SEARCH, in the form that the method takes."""
     numbers = settings.model_dump() | chosen
     numbers |= {name: tuple(numbers[name]) for name in ("updates", "explore")}
     dqn = agent.DqnSettings(**{name: numbers[name] for name in agent.DqnSettings._fields})
@@ -66,14 +67,14 @@ def training(settings: TrainAgent, chosen: dict[str, Any]) -> agent.PublishedTra
 
 
 def first_key(seed: int) -> jax.Array:
-    """The key that training from this seed begins with."""
+    """Returns the key with which training from this seed begins."""
     return jax.random.fold_in(jax.random.key(seed), 0)
 
 
 class SearchedRun(NamedTuple):
-    """One setting from one seed: updates of phase 4 before its best checkpoint, as validation chose it, and
-    the percent of validation runs that settle, and that settle and stay; the same of fresh runs, of the best
-    checkpoint and of the phase's end."""
+    """One setting from one seed. `updates`: updates of phase 4 before its best checkpoint, chosen by
+    validation; the percentage of validation runs that settle, and that settle and stay; the same of fresh
+    runs, for the best checkpoint and for the end of the phase."""
 
     updates: int
     validated_settled: float
@@ -86,7 +87,7 @@ class SearchedRun(NamedTuple):
 
 @cache
 def third_phase(seed: int, how: agent.PublishedTraining) -> tuple[agent.DqnState, jax.Array]:
-    """The train state after phase 3, and the key of all phases."""
+    """Returns the train state after phase 3, and the key of all phases."""
     train_state, key = agent.begin_published(first_key(seed), how)
     for i in range(len(PHASES)):
         train_state = agent.published_phase(train_state, key, how, i).train_state
@@ -94,14 +95,14 @@ def third_phase(seed: int, how: agent.PublishedTraining) -> tuple[agent.DqnState
 
 
 def searched_run(settings: TrainAgent, chosen: dict[str, Any], seed: int) -> SearchedRun:
-    """All phases by these settings from this seed."""
+    """Trains all phases with these settings from this seed."""
     code = [made.code_digest((LOOP / name).read_text(encoding="utf-8")) for name in CODE]
     digest = joblib.hash((settings.model_dump() | chosen, seed, code, jax.__version__))
     entry = MEMO / f"{digest}.json"
     if entry.is_file():
         return SearchedRun(**artifacts.read_json(entry))
     how = training(settings, chosen)
-    # what phase 4 alone sees is the same for all, so that phases 1 to 3 are trained once
+    # settings that only phase 4 uses are the same here for all, so that phases 1 to 3 are trained once
     shared = how._replace(rate_at_end=1.0, explore=(*how.explore[:3], 1.0))
     train_state, key = third_phase(seed, shared)  # ty: ignore[invalid-argument-type]
     result = agent.published_phase(train_state, key, how, len(PHASES))
@@ -120,8 +121,8 @@ def searched_run(settings: TrainAgent, chosen: dict[str, Any], seed: int) -> Sea
 
 
 def search(settings: TrainAgent) -> dict[str, Any]:
-    """Every setting from every seed; the setting whose seeds stay most on average in validation, and of it
-    the seed that stays most there."""
+    """Runs every setting from every seed. Returns the setting whose seeds stay most on average in validation,
+    and its seed that stays most there."""
     grid = [dict(zip(SEARCH, values, strict=True)) for values in itertools.product(*SEARCH.values())]
     runs: list[list[SearchedRun]] = [[] for _ in grid]
     for seed in SEEDS:

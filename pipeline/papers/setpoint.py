@@ -1,9 +1,9 @@
-"""Li and Pattinson 2025 beside us: the agent of the paper on the paper's own simulator, phase by phase, the
+"""Reproduces Li and Pattinson 2025: the paper's agent on the paper's own simulator, phase by phase, the
 single runs that it shows, both readings of its rho, and how long to wait.
 
 `./run dvc repro datasets/papers/dvc.yaml:setpoint` writes datasets/papers/setpoint.json, which
-reports/papers.html shows; minutes. The agent is the kept one of train_agent; once more it is trained with rho
-read the other way. The paper prints neither delta, alpha nor sigma of its simulator: ours are in
+reports/papers.html shows; it takes minutes. The agent is the one kept by train_agent. It is trained a second
+time with rho read the other way. The paper does not give delta, alpha and sigma of its simulator; ours are in
 pipeline/setpoint/published.py.
 """
 
@@ -50,7 +50,7 @@ FLUCTUATES, AT_REST = 5.0, 0.1
 RHO = 0.7
 # the class right as often as the paper's, and always
 ASKED_TO_WAIT = {"wait": RHO, "sure": 1.0}
-# what the paper prints of single runs: in these of our draws it is looked for, within half a percent
+# the paper's figures of single runs, searched in this many random runs of ours, within half a percent
 DRAWS, NEAR = 4000, 0.005
 PRINTED_RUNS: dict[str, dict[str, float]] = {
     "figure_3": {"rests_at": 101.0},
@@ -64,7 +64,7 @@ TRIED_UPDATES, TRIED_SEEDS = ((125, 500, 2000), (125, 500, 2000)), (1, 2)
 
 
 class PhaseNetworks(NamedTuple):
-    """The networks after each phase, the fourth with the class right with probability 0.7 and with 0.3, and
+    """The networks after each phase, the fourth with the class right with probability 0.7 and with 0.3; and
     the mean reward of a step over stretches of each phase."""
 
     by_name: dict[str, agent.QNetwork]
@@ -72,7 +72,7 @@ class PhaseNetworks(NamedTuple):
 
 
 def networks(how: agent.PublishedTraining, seed: int) -> PhaseNetworks:
-    """The kept agent, and the one whose phase 4 takes rho for the probability of a wrong class."""
+    """Returns the kept agent, and the one whose phase 4 takes rho as the probability of a wrong class."""
     otherwise = agent.train_published(first_key(seed), how._replace(accuracy=1 - RHO)).networks[-1]
     kept = restore_published("datasets/papers/train_agent/weights.safetensors").networks
     by_name = {f"phase_{i + 1}": network for i, network in enumerate(kept)}
@@ -82,7 +82,8 @@ def networks(how: agent.PublishedTraining, seed: int) -> PhaseNetworks:
 
 
 def single(path: Trajectory, *, shown: bool) -> dict[str, Any]:
-    """One start: where it rests, how far it goes past once it came near, and the first of its runs."""
+    """Returns one start: where it rests, how far it overshoots after it came near, and, if `shown`, the first
+    of its runs."""
     q, u = (np.asarray(a, float) for a in (path.flow, path.temperature))
     shares = np.asarray(path.shares, float)[0]
     run = {
@@ -94,8 +95,8 @@ def single(path: Trajectory, *, shown: bool) -> dict[str, Any]:
 
 
 def measure(q: np.ndarray, u: np.ndarray) -> dict[str, float | None]:
-    """Medians of runs (n, steps + 1): those of claims.measure_runs; where the temperature rests, its least,
-    and its least after it first came within 2 °C of the best."""
+    """Returns medians of runs (n, steps + 1): those of claims.measure_runs; where the temperature rests, its
+    minimum, and its minimum after it first came within 2 °C of the best."""
     came = np.maximum.accumulate(np.abs(u - BEST_TEMPERATURE) <= 2.0, axis=1)
     dips = np.where(came, u, np.inf).min(axis=1)[came.any(axis=1)]
     return claims.measure_runs(q, u) | {
@@ -106,8 +107,8 @@ def measure(q: np.ndarray, u: np.ndarray) -> dict[str, float | None]:
 
 
 def draws(network: agent.QNetwork, start: str, accuracy: float) -> dict[str, Any]:
-    """DRAWS single runs from a start: in how many percent of them each printed figure comes out, in how many
-    draws all do, and the figures of the draw that is nearest to what is printed."""
+    """Runs DRAWS single runs from a start. Returns the percentage of them that reproduce each published
+    figure, the number that reproduce all, and the figures of the run nearest to the published ones."""
     printed, (flow, temperature) = PRINTED_RUNS[start], SINGLE[start]
     conditions = nominal(np.full(DRAWS, flow), temperature, accuracy=accuracy)
     key = jax.random.key(agent.JUDGED_SEED)
@@ -131,8 +132,8 @@ def draws(network: agent.QNetwork, start: str, accuracy: float) -> dict[str, Any
 
 
 def right_enough(network: agent.QNetwork) -> dict[str, Any]:
-    """How often the class has to be right until the runs from all starts of a figure, and of all, settle: the
-    least of TRIED_ACCURACIES in percent, and how many settle with it."""
+    """Returns how often the class must be right so that the runs from all starts of a figure, and of all,
+    settle: the least of TRIED_ACCURACIES in percent, and how many settle with it."""
     found: dict[str, Any] = {}
     for accuracy in TRIED_ACCURACIES:
         of = starts(network, float(accuracy))
@@ -143,9 +144,10 @@ def right_enough(network: agent.QNetwork) -> dict[str, Any]:
 
 
 def short_phases(how: agent.PublishedTraining) -> dict[str, Any]:
-    """Figure 7 (a) to (d) after shorter phases, whose length the paper does not print: of phase 1 the ranges
-    of flow and temperature over the second half of the run, of phase 2 from each of these the same. How many
-    do as is told, and the figures of the first that does in both phases."""
+    """Tests figure 7 (a) to (d) after shorter phases, because the paper does not give their length. For phase
+    1 it takes the ranges of flow and temperature over the second half of the run, and the same for phase 2
+    after each of these. Returns how many behave as the paper says, and the figures of the first that does in
+    both phases."""
     rows: list[dict[str, Any]] = []
     for seed, first in itertools.product(TRIED_SEEDS, TRIED_UPDATES[0]):
         train_state, key = agent.begin_published(first_key(seed), how)
@@ -168,7 +170,8 @@ def short_phases(how: agent.PublishedTraining) -> dict[str, Any]:
 def shortened(
     train_state: agent.DqnState, key: jax.Array, how: agent.PublishedTraining, i: int, updates: int
 ) -> tuple[agent.DqnState, list[float]]:
-    """Phase i + 1 with so many updates, and the ranges in percent and °C of the runs of Figure 7."""
+    """Runs phase i + 1 with `updates` updates. Returns the state, and the ranges in percent and °C of the
+    runs of figure 7."""
     lengths = (*how.updates[:i], updates, *how.updates[i + 1 :])
     train_state = agent.published_phase(train_state, key, how._replace(updates=lengths), i).train_state
     path = claims.run_start(train_state.network, *SINGLE["figure_7"], accuracy=1.0)  # ty: ignore[invalid-argument-type]
@@ -177,7 +180,8 @@ def shortened(
 
 
 def starts(network: agent.QNetwork, accuracy: float) -> dict[str, Any]:
-    """The 21 starts: settled and staying, in percent, and settled by start."""
+    """Runs the 21 starts. Returns the percentages that settle and that stay, and those that settle by
+    start."""
     path = agent.run_starts(network, accuracy=accuracy)
     q, u = np.asarray(path.flow), np.asarray(path.temperature)
     told = score.judge(q, u)
@@ -203,8 +207,8 @@ def starts(network: agent.QNetwork, accuracy: float) -> dict[str, Any]:
 
 
 def together(q: np.ndarray, u: np.ndarray, settled: np.ndarray) -> dict[str, float]:
-    """One run from each start, as the paper shows: in how many percent of such repeats all settle, of the
-    starts of each figure and of all 21."""
+    """Returns the percentage of repeats in which all runs settle, with one run from each start as in the
+    paper: for the starts of each figure and for all 21."""
     each = {
         (flow, temperature): settled[(q[:, 0] == flow) & (np.abs(u[:, 0] - temperature) < 1e-3)]
         for flow, temperature in itertools.product(trials.START_FLOWS, trials.START_TEMPERATURES)
@@ -234,8 +238,9 @@ APPENDIX = {
 
 
 def waits(network: agent.QNetwork) -> dict[str, Any]:
-    """Steps from (30 %, 190 °C) until a run is in the band for good, on average over all runs, one step more
-    than are judged for those that are never; twice the standard error; and how many percent settle."""
+    """Returns the steps from (30 %, 190 °C) until a run is in the band for good, as a mean over all runs; a
+    run that never is counts one step more than are judged. Also returns twice the standard error, and the
+    percentage of runs that settle."""
     out: dict[str, dict[str, Any]] = {}
     (flow, temperature), ones = SINGLE["case_2"], jnp.ones(WAITING_RUNS)
     key = jax.random.key(agent.JUDGED_SEED)
@@ -257,21 +262,21 @@ def waits(network: agent.QNetwork) -> dict[str, Any]:
 
 
 def waiting_helps(of: dict[str, Any]) -> bool:
-    """Whether the long wait takes fewer steps by more than chance, if the class errs as often as the paper's
-    and pictures show the line of before the move for a while."""
+    """Returns whether the long wait needs fewer steps by more than chance, if the class errs as often as the
+    paper's and pictures show for a while the line from before the move."""
     three, six = (of[f"wait_{wait_s:.0f}_view_{SHOWN_VIEW_S:.0f}"] for wait_s in WAITS_S)
     return bool(three["steps"] - six["steps"] > math.hypot(three["error"], six["error"]))
 
 
 def scaled(shares: list[list[float]]) -> bool:
-    """Whether every window has its largest share at one, and the others are noisy below it."""
+    """Returns whether the largest share of every window is one, and the others are noisy below it."""
     table = np.array(shares)
     others = np.sort(table, axis=1)[:, :2]
     return bool((table.max(axis=1) == 1).all() and others.std() > 0.05 and others.mean() < 0.5)
 
 
 def rewards_of(agents: PhaseNetworks, how: agent.PublishedTraining) -> dict[str, Any]:
-    """Figure 6: the mean reward of a step times the steps of an episode."""
+    """Returns figure 6: the mean reward of a step times the steps of an episode."""
     phases = [[round(how.dqn.episode * float(value), 3) for value in values] for values in agents.rewards]
     ends = {f"phase_{i + 1}": {"begins": part[0], "ends": part[-1]} for i, part in enumerate(phases)}
     falls = [after[0] < before[-1] for before, after in itertools.pairwise(phases)]
@@ -281,7 +286,7 @@ def rewards_of(agents: PhaseNetworks, how: agent.PublishedTraining) -> dict[str,
 
 
 def table_2(how: agent.PublishedTraining) -> dict[str, Any]:
-    """What table 2 lists, as it was used here."""
+    """Returns the values of table 2, as used here."""
     return {
         "gamma": how.dqn.gamma,
         "tau": how.dqn.tau,
@@ -297,7 +302,7 @@ def table_2(how: agent.PublishedTraining) -> dict[str, Any]:
 
 
 def arithmetic() -> dict[str, Any]:
-    """Numbers of the paper that follow from others of it."""
+    """Returns numbers of the paper that follow from others of it."""
     seen, valid, combinations, each = 69_668, 56_225, 15, 300
     steps, minutes = (95, 40), (10.21, 6.29)
     rests, first, least, most = 95.0, 90.0, 75.0, 130.0
@@ -311,7 +316,7 @@ def arithmetic() -> dict[str, Any]:
 
 
 def sizes(networks: PhaseNetworks) -> dict[str, Any]:
-    """Parameters of the networks, and what table 1 lists."""
+    """Returns the numbers of parameters of the networks, and the values of table 1."""
     classifier = vision_transformer(PAPER, np.random.default_rng(0))
     return {
         "head": parameters(classifier.head),

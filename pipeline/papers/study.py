@@ -1,5 +1,5 @@
-"""What the learners reach on the study's machine, where the optimum is known: without noise, and on many
-noisy data sets; the yardstick beside the paper's figures."""
+"""Runs the learners on the study's machine, whose optimum is known: without noise, and on many noisy data
+sets. It is the reference for the paper's figures."""
 
 from collections.abc import Sequence
 
@@ -29,11 +29,11 @@ def study_signal(
     variance: float,
     redrawn: bool = True,
 ) -> np.ndarray:
-    """omega_pr (samples, inputs) of (51), (52): a sinusoid at the bandwidth, one for each further amplitude
-    at a random frequency below it, and Gaussian noise.
+    """Returns omega_pr (samples, inputs) of (51), (52): a sinusoid at the bandwidth, one for each further
+    amplitude at a random frequency below it, and Gaussian noise.
 
-    `redrawn` draws the frequencies anew every step, as the study's script does (nearly white); without it
-    they are fixed, as the text reads. bandwidth in rad a step.
+    `redrawn` draws new frequencies at every step, as the study's script does (nearly white). Without it they
+    are fixed, as the text says. bandwidth in rad per step.
     """
     t = np.arange(samples)[:, None]
     signal = np.sqrt(variance) * rng.standard_normal((samples, inputs)) + amplitudes[0] * np.sin(
@@ -48,9 +48,9 @@ def study_signal(
 def study_probe(
     plant: Plant, signal: np.ndarray, K_data: np.ndarray, *, x0: np.ndarray, noise: np.ndarray
 ) -> Probe:
-    """u = -K_data x + omega_pr (50), which reads the true state and knows no limits: for parity and
-    benchmarks only. signal and noise may carry a batch axis: signal (samples, batch, m), noise (samples,
-    batch, p) give u and y of the same shapes."""
+    """Returns the record of u = -K_data x + omega_pr (50), which reads the true state and has no limits: for
+    parity and benchmarks only. signal and noise may have a batch axis: signal (samples, batch, m), noise
+    (samples, batch, p) give u and y of the same shapes."""
     closed = (plant.A - plant.B @ K_data).T
     x = np.empty((len(signal), *signal.shape[1:-1], plant.n))
     x[0] = x0
@@ -61,8 +61,8 @@ def study_probe(
 
 
 def reconstruction(plant: Plant, N: int) -> np.ndarray:
-    """M (n, N (m+p)) with x(t) = M [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)] (23)-(28), exact where N
-    reaches the observability index (b = d = 0)."""
+    """Returns M (n, N (m+p)) with x(t) = M [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)] (23)-(28). It is exact
+    if N is at least the observability index (b = d = 0)."""
     n, m, p = plant.n, plant.m, plant.p
     powers = [np.eye(n)]
     for _ in range(N):
@@ -80,8 +80,8 @@ def reconstruction(plant: Plant, N: int) -> np.ndarray:
 
 
 def exact_gains(plant: Plant, gains: Gains, N: int) -> tuple[np.ndarray, np.ndarray]:
-    """K (m, N (m+p)) and K_r (m, p) of (32) from the model: what a
-    learned kernel should give on noise-free data."""
+    """Returns K (m, N (m+p)) and K_r (m, p) of (32) from the model, which a kernel learned from noise-free
+    data should equal."""
     return gains.K_x @ reconstruction(plant, N), gains.K_r
 
 
@@ -96,13 +96,13 @@ def fitness(
     x0: np.ndarray,
     k=0.0,
 ) -> float:
-    """F = sum_{t=0..l} gamma^t (|y(t) - r|^2 + |u(t)|^2)
+    """Returns F (37) of u = -K_x x - K_r r - k with the state known and r constant.
 
-    of u = -K_x x - K_r r - k with the state known and r constant (37).
+        F = sum_{t=0..l} gamma^t (|y(t) - r|^2 + |u(t)|^2)
 
-    K_x (m, n), K_r (m, p), k (m,), reference r (p,) in °C, x0 (n,), steps = l >= 0: l + 1 terms. With
-    z = [x; 1] the loop is z(t+1) = M z(t), so that all z come from log2(l) products, Z <- [Z, M^i Z]. Raises
-    ValueError where the closed loop is unstable.
+    K_x (m, n), K_r (m, p), k (m,), reference r (p,) in °C, x0 (n,), steps = l >= 0: l + 1 terms. With z = [x;
+    1] the loop is z(t+1) = M z(t), so that all z come from log2(l) products, Z <- [Z, M^i Z]. Raises
+    ValueError if the closed loop is unstable.
     """
     A_cl = plant.A - plant.B @ K_x
     radius = np.abs(np.linalg.eigvals(A_cl)).max()
@@ -133,11 +133,12 @@ def panel(
     hold: int,
     cells: bool,
 ) -> Scenarios:
-    """Every plant x start x reference x noise level, once without noise and once a seed with it.
+    """Returns every combination of plant, start, reference and noise level, once without noise and once per
+    seed with noise.
 
-    A start is a temperature in °C at which the plant is held by its steady input: of every cell where the
-    states are `cells`, of every sensor otherwise. Each scenario draws its noise from its own seed, so that
-    every controller sees the same.
+    A start is a temperature in °C at which the plant is kept by its steady input: of every cell if the states
+    are `cells`, else of every sensor. Each scenario's noise depends on its own seed only, so every controller
+    gets the same noise.
     """
     rows = []
     for index, plant in enumerate(plants):
@@ -160,8 +161,8 @@ def panel(
 def study_panel(
     references: np.ndarray, *, noise: float = 0.0, seeds: tuple[int, ...] = (0,), hold: int = 0
 ) -> Scenarios:
-    """The study's machine, held at 20 °C in every cell by its steady
-    input, for each reference (k, 5); 1,000 steps."""
+    """Returns the study's machine, kept at 20 °C in every cell by its steady input, for each reference (k,
+    5); 1,000 steps."""
     return panel(
         [baam()],
         starts=[20.0],
@@ -175,14 +176,14 @@ def study_panel(
 
 
 def gap(law: Law, scenarios: Scenarios) -> np.ndarray:
-    """J / J* - 1 of each scenario, unclipped, Q = R = I."""
+    """Returns J / J* - 1 of each scenario, unclipped, Q = R = I."""
     run = simulate(scenarios, law)
     return cost(scenarios, run, YARDSTICK) / optimum(scenarios, YARDSTICK) - 1
 
 
 def data_sets(rng: np.random.Generator, samples: int, sets: int) -> tuple[np.ndarray, np.ndarray]:
-    """`sets` runs of the study's probing (50) from 50 °C, noise-free:
-    u (samples, sets, 7), y (samples, sets, 5)."""
+    """Returns `sets` runs of the study's probing (50) from 50 °C, noise-free: u (samples, sets, 7), y
+    (samples, sets, 5)."""
     signal = study_signal(
         rng, samples, 7 * sets, amplitudes=AMPLITUDES, bandwidth=BANDWIDTH, variance=VARIANCE
     ).reshape(samples, sets, 7)
@@ -191,7 +192,7 @@ def data_sets(rng: np.random.Generator, samples: int, sets: int) -> tuple[np.nda
 
 
 def kernel_of(u: np.ndarray, y: np.ndarray, N: int) -> Kernel:
-    """Algorithm 2 at Q = R = I on one record, mu = 0."""
+    """Returns the kernel of Algorithm 2 at Q = R = I from one record, mu = 0."""
     return value_iteration(regress(tuples([u], [y], N)), np.eye(y.shape[1]), np.eye(u.shape[1]), GAMMA)
 
 
@@ -200,9 +201,9 @@ def law_of(kernel: Kernel, N: int) -> Law:
 
 
 def exact() -> dict[str, dict[str, float]]:
-    """J over 1,000 (100) steps from 20 °C, Q = R = I: the optimum that knows the state, and the observer that
-    does not; and what a wrong start costs: the paper's 50 °C estimate, and a window filled with u = 0 and
-    y(0)."""
+    """Returns J over 1,000 (100) steps from 20 °C, Q = R = I, for the optimum, which knows the state, and for
+    the observer, which does not. Also returns the cost of a wrong start: the paper's 50 °C estimate, and a
+    window filled with u = 0 and y(0)."""
     plant, scenarios = baam(), study_panel(REFERENCE[None])
     best = gains(plant, np.eye(5), np.eye(7), GAMMA)
     short = scenarios._replace(steps=100)
@@ -225,9 +226,9 @@ def exact() -> dict[str, dict[str, float]]:
 def noise_free(
     u: np.ndarray, y: np.ndarray, rng: np.random.Generator, *, references: int = 20
 ) -> dict[str, float]:
-    """Gaps of Algorithm 2 from the study's own record u (T, 7), y (T, 5) without its first row: `gap` and
-    `gap_window_6` with a window of 2 on 500 and of 6 on 1,610 samples for the study's reference;
-    `any_reference_gap`, from 540 samples, is the worst of `references` drawn from 100 to 220 °C."""
+    """Returns the gaps of Algorithm 2 from the study's own record u (T, 7), y (T, 5) without its first row.
+    `gap` and `gap_window_6`: with a window of 2 on 500 and of 6 on 1,610 samples for the study's reference;
+    `any_reference_gap`: from 540 samples, the worst of `references` random references from 100 to 220 °C."""
     one, many = study_panel(REFERENCE[None]), study_panel(rng.uniform(100.0, 220.0, (references, 5)))
     gaps = {}
     sets = {"gap": (2, 500, one), "gap_window_6": (6, 1610, one), "any_reference_gap": (2, 540, many)}
@@ -244,8 +245,8 @@ ROUTES = ("window", "kernel", "kernel_predicted_state")
 def under_noise(
     u: np.ndarray, y: np.ndarray, *, noise: float, seed: int, longest: int = 24
 ) -> dict[str, tuple[float, float]]:
-    """(gap, r.m.s. error in °C over steps 500-1000) of each route on one data set with `noise` °C on y; the
-    controller sees the same noise while it is judged."""
+    """Returns (gap, r.m.s. error in °C over steps 500-1000) of each route on one data set with `noise` °C on
+    y. The controller gets noise of the same size while it is judged."""
     y = y + noise * np.random.default_rng(seed).standard_normal(y.shape)
     scenarios, identity = (
         study_panel(REFERENCE[None], noise=noise, seeds=(seed,), hold=longest),
@@ -272,7 +273,7 @@ def under_noise(
 def rows(
     work: Sequence[tuple[float, int]], results: Sequence[dict[str, tuple[float, float]]]
 ) -> dict[str, list]:
-    """`under_noise` of each (noise, data set) as columns, one row a route."""
+    """Returns `under_noise` of each (noise, data set) as columns, one row per route."""
     table = [
         (route, noise, index, *result[route])
         for (noise, index), result in zip(work, results, strict=True)
@@ -284,8 +285,8 @@ def rows(
 
 
 def tuning_objective(theta: np.ndarray) -> float:
-    """(37) of theta = [q (5,); r (7,)] on the study's machine: l = 100, from 20 °C, the state known, the gain
-    from the discounted Riccati equation."""
+    """Returns (37) of theta = [q (5,); r (7,)] on the study's machine: l = 100, from 20 °C, the state known,
+    the gain from the discounted Riccati equation."""
     plant = baam()
     best = gains(plant, np.diag(theta[:5]), np.diag(theta[5:]), GAMMA)
     return fitness(
@@ -294,9 +295,10 @@ def tuning_objective(theta: np.ndarray) -> float:
 
 
 def scaled_weights(scale: float = 0.4) -> dict[str, float]:
-    """Q = R = scale I beside Q = R = I: the change of the index when each is computed with its own weights,
-    in percent, and the largest difference of the gains. Indices with different weights say nothing: scaling
-    all weights changes the printed index by as much, and the controller not at all."""
+    """Returns the change of the index in percent from Q = R = I to Q = R = scale I if each is computed with
+    its own weights, and the largest difference of the gains. It shows that indices with different weights
+    cannot be compared: scaling all weights changes the index by the same factor, and the controller not at
+    all."""
     plant, scenarios = baam(), study_panel(REFERENCE[None])
     one, other = (gains(plant, factor * np.eye(5), factor * np.eye(7), GAMMA) for factor in (1.0, scale))
     law = observer_law(plant, other, observer_gain(plant, TAU))
@@ -312,8 +314,8 @@ def scaled_weights(scale: float = 0.4) -> dict[str, float]:
 
 
 def parity_metrics(result: SearchResult) -> dict:
-    """What a search for the least (37) ends at, beside its known optimum, Q = R = I, and the weights that it
-    recommends."""
+    """Returns the result of a search for the least (37), its known optimum, Q = R = I, and the weights that
+    it recommends."""
     return {
         "best_cost_perfect_state": result.cost,
         "optimum": tuning_objective(np.ones(OUTPUTS + INPUTS)),

@@ -1,4 +1,4 @@
-"""The draws behind the temperature study's figures, as they were published."""
+"""The published random data behind the temperature study's figures."""
 
 from pathlib import Path
 
@@ -9,7 +9,8 @@ from pipeline.store import artifacts
 
 
 def read_published(folder: str | Path = "datasets/published") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """K0 (7, 11) of the study, and its probing log as inputs (15000, 7) and outputs (15000, 5)."""
+    """Reads K0 (7, 11) of the study, and its probing log as inputs (15000, 7) and outputs (15000, 5). Raises
+    ValueError if the files cannot be read."""
     try:
         K0 = np.loadtxt(Path(folder) / "algorithm1_K0_seed10.csv", delimiter=",", ndmin=2)
         log = pq.read_table(Path(folder) / "probing_log_seed1.parquet")

@@ -1,9 +1,9 @@
-"""The agent of Li and Pattinson (2025), trained in its own simulator by the best setting from the best seed
-of search_agent: writes datasets/papers/train_agent/, which every loop, page and quick look reads. The agent
-that lies there is kept if more of its validation runs stay: a paper is judged by the best known of it.
+"""Trains the agent of Li and Pattinson (2025) in its own simulator, with the best setting and the best seed
+of search_agent. Writes datasets/papers/train_agent/, which every loop, page and quick look reads. The stored
+agent is kept if more of its validation runs stay, because a paper is judged by its best known agent.
 
-`./run dvc repro datasets/papers/dvc.yaml:train_agent`; minutes. weights.safetensors: its network after each
-phase; agents.parquet: the learning curves; figures.json: what it comes to. No recording changes it.
+`./run dvc repro datasets/papers/dvc.yaml:train_agent`; it takes minutes. weights.safetensors: its network
+after each phase; agents.parquet: the learning curves; figures.json: its results. No recording changes it.
 """
 
 import itertools
@@ -25,14 +25,15 @@ from pipeline.store import artifacts, params
 from pipeline.store.pins import check_pins
 
 FOLDER = Path("datasets/papers/train_agent")
-# of the runs that choose between the agent that was trained and the one that lies there
+# seed of the runs that choose between the trained and the stored agent
 VALIDATED_SEED = 20
 # points of a learning curve that a page has room for, of each phase
 POINTS = 50
 
 
 def learning_curve(published: agent.PublishedAgent) -> dict[str, list]:
-    """Columns of schema AGENT_CURVE: the mean reward of a step over POINTS stretches of each phase."""
+    """Returns the columns of schema AGENT_CURVE: the mean reward of a step over POINTS stretches of each
+    phase."""
     points: list[tuple[str, int, int, float]] = []
     before = 0
     for i, rewards in enumerate(published.rewards):
@@ -48,8 +49,9 @@ def learning_curve(published: agent.PublishedAgent) -> dict[str, list]:
 
 
 def figures(how: agent.PublishedTraining, networks: Sequence[agent.QNetwork]) -> dict[str, Any]:
-    """The agent after three phases and after the last one, if the class is always right and if it is not, on
-    the paper's simulator; what the paper claims of it; and what the paper does not print."""
+    """Returns figures of the agent after three phases and after the last one on the paper's simulator, if the
+    class is always right and if it is not; the paper's claims about it; and the values that the paper does
+    not give."""
     return claims.simulated_figures(networks) | {
         "parameters": {"li_2025": claims.parameters(networks[0])},
         "claims": claims.compare_starts(networks, accuracy=how.accuracy),
@@ -58,7 +60,7 @@ def figures(how: agent.PublishedTraining, networks: Sequence[agent.QNetwork]) ->
 
 
 def guesses(how: agent.PublishedTraining) -> dict[str, Any]:
-    """What the paper does not print and we set, by its name there or in words."""
+    """Returns the values that the paper does not give and that we set, by their name there or in words."""
     return {
         "delta": DELTA,
         "alpha": ALPHA,
@@ -75,7 +77,8 @@ def guesses(how: agent.PublishedTraining) -> dict[str, Any]:
 
 
 def validated_stay(network: agent.QNetwork, key: jax.Array, how: agent.PublishedTraining) -> float:
-    """Percent of the validation runs that settle and stay, on draws of their own."""
+    """Returns the percentage of the validation runs, with random numbers of their own, that settle and
+    stay."""
     conditions = trials.starts(agent.VALIDATION_RUNS, accuracy=how.accuracy)
     windows = agent.paper_windows()
     return trials.evaluate(agent.published(network), network, windows, conditions, key).stay.percent

@@ -21,7 +21,7 @@ import scipy.special
 # nozzle) and rows averaged to find the run
 BLOCK, COARSE = 8, 4
 # rows outward and inward of an edge in its window; levels of the background, beside the edge and deeper
-# inside are read where a blurred edge has come to rest
+# inside are read at rows that even a blurred edge does not reach
 OUT, IN = 12, 20
 OUTSIDE, NEAR, FAR = np.arange(-OUT, -5), np.arange(5, 9), np.arange(12, 21)
 NEAR_ROW, FAR_ROW, NEAR_VARIANCE, FAR_VARIANCE = (
@@ -43,18 +43,18 @@ OUTWARD = np.array([-1, 1]).reshape(2, 1, 1)
 OUTWARDS = OUTWARD * np.arange(3).reshape(3, 1, 1, 1)
 REACH = -OUTWARD[..., None] * np.arange(-OUT, IN + 1)
 THREE, THREE_VARIANCE = np.full((1, 3), 1 / 3, np.float32), 2 / 3
-# where one edge is brighter than the other by this share of the plateau, the specular line lies beside it
+# if one edge is brighter than the other by this share of the plateau, the specular line lies beside it
 UNEVEN = 0.12
-# edge, blur and shading settle within so many rounds, two where the edge is sharp
+# edge, blur and shading settle within this many rounds, within two if the edge is sharp
 ROUNDS = 12
-# a coarse row is bead where it stands so many standard deviations of the background above it, one in 10^9
-# rows of noise, and this share of the steps
+# a coarse row is bead if it exceeds the background by this many standard deviations (one in 10^9 rows of
+# noise does) and by this share of the steps
 SIGNIFICANT, STEEP = 6.0, 0.2
 # fewer levels (of 0..255) between bead and ground are what rounding and compression make of light and noise
 FAINTEST = 6.0
 # a stronger blur, px, is read too low, up to this one
 RESOLVED_PX, UNRESOLVED_PX = 3.3, 6.0
-# a line whose width changes its course by more from block to block, as share of itself and in px, is grain
+# it is grain, not a line, if its width bends by more from block to block, as share of the width plus px
 RAGGED, RAGGED_PX = 0.1, 2.0
 # a plateau above all levels: no bead
 NONE = 1e9
@@ -66,12 +66,11 @@ class Bead(NamedTuple):
     """The bead in one frame. columns (n,) are the centres of blocks of 8 columns; widths (n,), top (n,) and
     bottom (n,) in px across the line, pixel centres at whole rows.
 
-    widths is 0 where the block shows background only and NaN where it cannot be read. `width` is the line
-    fitted robustly through the widths, at the middle of the blocks that it uses, and `deviation` its standard
-    deviation; both NaN where `reason` is not empty: "no bead", "saturated", "cut by the frame", "blurred",
-    "faint", "ragged".
-    `angle_deg` is the line's direction against the rows, `blur_px` the standard deviation of the edge,
-    `contrast` bead less background in levels.
+    widths is 0 if the block shows background only and NaN if it cannot be read. `width` is the line fitted
+    robustly through the widths, at the middle of the blocks that it uses, and `deviation` its standard
+    deviation. Both are NaN if `reason` is not empty: "no bead", "saturated", "cut by the frame", "blurred",
+    "faint", "ragged". `angle_deg` is the line's direction against the rows, `blur_px` the standard deviation
+    of the edge, `contrast` bead less background in levels.
     """
 
     columns: np.ndarray
@@ -238,7 +237,8 @@ def measure_all(
         }
         reason = next((name for name, holds in reasons.items() if holds), "")
         if reason:
-            # in a frame without a bead what is bare substrate stays 0, in a spoilt one nothing is measured
+            # in a frame without a bead the bare substrate keeps width 0; in a spoilt frame nothing is
+            # measured
             nothing = np.full(n, math.nan)
             measured = widths[i] if reason == "no bead" else nothing
             out.append(
@@ -417,7 +417,7 @@ def fine(g: np.ndarray, first: CoarseEdges) -> tuple[np.ndarray, np.ndarray]:
     specular line lies beside it, and the other edge gives the plateau of both.
     """
     k, n, h = g.shape
-    # a speck beside the bead moves one block's coarse edge, not its neighbours'
+    # a speck beside the bead shifts one block's coarse edge, not its neighbours'
     coarse = first.rows.astype(np.float32).reshape(2 * k, 1, n)
     rows = np.rint([cv2.medianBlur(edge, 5)[0] for edge in coarse]).astype(int).reshape(2, k, n)
     E = g.ravel().take((rows + (h * np.arange(k * n)).reshape(k, n))[..., None] + REACH, mode="clip") * (
@@ -487,7 +487,7 @@ def _settled(read, steep, inward, clean, rise, width, fall, plateau) -> tuple[np
     # blur carries the shading's slope over the edge: (p0 + q x) Phi(x
     # / s) + q s phi(x / s) = p0 / 2 at x = -q s^2 / p0
     shift = (missing - spilt + fall - nearer) / (2 * steep) + q * variance / p0
-    # an edge so soft that no level came to rest passes for shading: then the whole plateau tells
+    # an edge so soft that no level reached its final value looks like shading, so the whole plateau is used
     apparent = plateau / (math.sqrt(2 * math.pi) * steep)
     return shift, np.where(blur < 0.6 * apparent, apparent, blur)
 

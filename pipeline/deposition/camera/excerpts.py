@@ -56,7 +56,7 @@ def places_to_show(
     begin = beads[good[0]][0]
     still = time_s[(speed < 0.05 * speed.max()) & (time_s > begin)]
     pause = float(still[0]) if len(still) else beads[good[-1]][0]
-    # the gantry stands at the end too: the pause ends where its first stretch does
+    # the gantry stands at the end too, so the pause ends with its first stretch
     ends = np.flatnonzero(np.diff(still) > 1.5 * np.median(np.diff(time_s))) if len(still) else []
     resumed = float(still[ends[0]]) if len(ends) else float(still[-1]) if len(still) else pause
     corner = resumed + travel_mm / max(float(speed.max()), 1e-9)

@@ -16,7 +16,7 @@ import scipy.sparse
 
 from pipeline.deposition.camera.bead import BLOCK, area
 
-# instants a sample at which the nozzle is placed: at 8 mm/s and 50 Hz every 20 um, a third of a place
+# instants per sample at which the nozzle is placed: at 8 mm/s and 50 Hz every 20 um, a third of a place
 INSTANTS = 8
 # a bead lower than this is not seen, px: its section is the least that a place without a bead may hide
 BLIND_PX = 8.0
@@ -27,13 +27,13 @@ SLOW = 0.05
 GATE = 5.0
 # residuals of A(s) beyond this many deviations get less weight (Huber 1964: 95 % efficient for normal errors)
 HUBER = 1.345
-# weights and scatter settle in so many rounds
+# weights and scatter settle within this many rounds
 ROUNDS = 3
 # widths within this share of the median are those of a steady line
 NEAR_USUAL = 0.15
 # log of the strengths that are tried: from no smoothing at all to a straight line
 STRENGTHS = (-8.0, 24.0)
-# prior weight of the amplitudes, far below anything that the data say: one that nobody sees stays 0
+# prior weight of the amplitudes, far below that of any data: an amplitude that no frame shows is 0
 RIDGE = 1e-6
 
 
@@ -113,7 +113,7 @@ def sections(
     count = np.bincount(of, keep)
     A, where = np.bincount(of, area(w, contact_angle_deg) * keep) / count, np.bincount(of, s * keep) / count
     slope, blind = np.sqrt(4 * area(1.0, contact_angle_deg) * A), area(BLIND_PX * px, contact_angle_deg)
-    # a place averages over its length: where A bends within it, the mean is not the value in the middle
+    # a place averages over its length: if A bends within it, the mean is not the value in the middle
     bend = np.convolve(np.pad(A, 1, "edge"), [1.0, -2.0, 1.0], "valid") / 12
     deviation = np.sqrt(slope**2 * scatter**2 / count + blind**2 / 12 + bend**2)
     return Sections(where, A, deviation, count.astype(int), length)
@@ -167,8 +167,8 @@ def _without_specks(place: np.ndarray, w: np.ndarray, px: float) -> tuple[np.nda
     of = np.repeat(np.arange(len(first)), count)
     median = w[first + (count - 1) // 2]
     miss = np.abs(w - median[of])
-    # one scatter for all places, a dozen readings each do not tell it;
-    # beside it the width may change along a place
+    # one scatter for all places, because a dozen readings of one place are too few; the width may also change
+    # along a place
     scatter = max(1.4826 * float(np.median(miss[w > 0])) if (w > 0).any() else 0.0, 0.02 * px)
     keep = miss <= (GATE * scatter + np.abs(np.gradient(np.pad(median, 1, "edge"))[1:-1]))[of]
     return of, keep, scatter

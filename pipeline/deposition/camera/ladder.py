@@ -25,8 +25,9 @@ class Rung(NamedTuple):
 
 
 class Ladder(NamedTuple):
-    """mm_per_px > 0; rotation_deg of the lines; known (n,) in mm and measured (n,) in px, growing; edge_bias
-    (n,) in px by which each looks wider than it is; deviation_px: the scatter of repeated pictures."""
+    """`mm_per_px` > 0; `rotation_deg` of the lines; `known_mm` (n,) and `measured_px` (n,): their widths,
+    growing; `edge_bias_px` (n,): by how much each looks wider than it is; `deviation_px`: the scatter of
+    repeated pictures."""
 
     mm_per_px: float
     rotation_deg: float

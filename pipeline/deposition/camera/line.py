@@ -18,25 +18,26 @@ from pipeline.deposition.camera.bead import gray
 
 # longest side in px at which a line is sought, and the step of its direction in degrees
 COARSE_PX, STEP_DEG = 200, 5.0
-# from a tip on it is followed so far, px of the small picture
+# a line is followed this far from a tip, and the ground beside it is averaged over this many rows; px of the
+# small picture
 REACH_PX, SIDE_PX = 64, 3
 # parts of the line's length in which its contrast must hold, and how many must be in the picture
 PARTS, FEWEST_PARTS = 10, 4
 # widths of the bands that are tried, in px of the small picture
 BANDS = (3, 4, 5, *range(6, 78, 3))
-# a band is a line where its contrast is so many levels and so many deviations of its parts
+# a band is a line if its contrast is at least this many levels, and this many deviations of its parts
 LEAST_CONTRAST, LEAST_SCORE = 6.0, 4.0
-# what is no part of the picture
+# value of pixels outside the picture
 OUTSIDE = -1e6
 # widths from which a bead has a plateau of its own, and the least picture that is cut out
 WIDE_PX, LEAST_PX = 64, 96
-# the line's place is found in so many frames without and with a bead
+# the line's place is found from this many frames without a bead and as many with one
 SAMPLE = 12
 # a line this near to the rows is measured as it lies
 LEVEL_DEG = 4.0
 # share of the difference between the edge biases of two widths by which one between them may be off
 BETWEEN = 0.15
-# of the gap to another line so much is left beside the bead
+# share of the gap to another line that is kept beside the bead
 GAP = 0.7
 
 # the gantry as recorded: time_s (T,), and its place (T,) in mm along the line

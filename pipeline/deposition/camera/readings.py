@@ -24,21 +24,22 @@ from pipeline.deposition.camera.line import Gantry, Mounting, pose
 
 # frames measured together
 TOGETHER = 16
-# readings along the line and bands across it, from which the pictures' motion is told: px of one reading
+# size in px of a reading along the line, and number of bands across it, from which the pictures' motion is
+# found
 STEP_PX, BANDS = 4, 16
-# what is this many times as blurred as the bead of most frames, or has this share of its contrast, is no bead
+# a bead this many times as blurred as in most frames, or with less than this share of their contrast, is none
 BLURRED, FAINT = 2.5, 0.4
 UNLIKE = "unlike the other frames"
 
 # latencies that are tried, s, and the step of the first search
 EARLIEST_S, LATEST_S, STEP_S = -0.06, 0.26, 0.01
-# frames count that lie so near to a change of speed, s
+# frames count if they are this near to a change of speed, s
 NEAR_S = 0.6
 # a change of speed, as share of the highest
 CHANGE = 0.05
 # neighbouring readings err alike: the formal deviation is too small by about this factor
 INFLATION = 8.0
-# no latency that is more than so many steps away may come so near to the best, in scatters of the sum
+# no latency more than this many steps away may be this near to the best, in scatters of the sum
 APART, DISTINCT = 3, 2.0
 # a travel of more readings than this is in another unit
 LONGEST_CELLS = 1e6
@@ -184,7 +185,7 @@ def estimate_latency(time_s: np.ndarray, signals: np.ndarray, gantry: Gantry, *,
     values = np.asarray(signals, np.float64)[used]
     if len(values) < 8:
         return UNTOLD
-    # what rides with the camera says nothing of the motion
+    # things that move with the camera show nothing of the motion
     values = values - values.mean(axis=0)
     times, cells = time_s[used], float(abs(step_mm))
     if np.ptp(gantry[1]) > LONGEST_CELLS * cells:
@@ -198,7 +199,7 @@ def estimate_latency(time_s: np.ndarray, signals: np.ndarray, gantry: Gantry, *,
     grid = np.arange(EARLIEST_S, LATEST_S + STEP_S / 2, STEP_S)
     misses = np.array([miss(L) for L in grid])
     k = int(np.argmin(misses))
-    # of noise alone the sum of squares scatters by this much from one latency to another
+    # for noise alone the sum of squares scatters by this much from one latency to another
     scatter = misses[k] * math.sqrt(2 / values.size)
     others = misses[np.abs(np.arange(len(grid)) - k) > APART]
     if k in (0, len(grid) - 1) or others.min() < misses[k] + DISTINCT * scatter:

@@ -14,15 +14,15 @@ from pipeline.deposition.camera.readings import Latency, Readings
 from pipeline.deposition.extruder import Routine
 from pipeline.deposition.learning.ilc import Trial
 
-# a recording may begin and end so much later and earlier than its routine
+# a recording may begin this much later, and end this much earlier, than its routine
 SLACK_S = 0.2
-# of the frames in which the line must be seen at most this share may have no usable bead
+# largest share of the frames that should show the line that may have no usable bead
 REJECTED = 0.5
 # the stage must be bare this far ahead of the line, mm: what oozes before lies nearer
 AHEAD_MM = 1.0
 # a line that looks wider at one end of the columns than at the other by this share is seen askew
 ASKEW = 0.04
-# by how much in px widths of a calibrated camera and of another one are off beyond what blur and light tell
+# error in px of the widths of a calibrated and of an uncalibrated camera, beyond what blur and light explain
 CALIBRATED_PX, UNCALIBRATED_PX = 0.2, 0.4
 
 

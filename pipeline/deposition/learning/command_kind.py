@@ -13,15 +13,17 @@ import scipy.signal
 from pipeline.deposition.drive import CommandKind, speed
 
 KINDS: tuple[CommandKind, ...] = get_args(CommandKind)
-# a flow above so many times the wanted one is at least that: a drive or a camera is at its end there
+# a flow above this many times the wanted one counts as this, because a drive or a camera is at its limit
+# there
 MOST = 2.5
-# what is known beforehand of gain and time constant holds within this factor
+# gain and time constant are known beforehand within this factor
 KNOWN = 3.0
-# (factor of the time constant, share of the flow that is the yield) from which a fit sets out; the best
-# STARTS are followed
+# start values of a fit: (factor of the time constant, share of the flow that is the yield); the best STARTS
+# are used
 GRID = tuple((factor, share) for factor in (0.4, 1.0, 2.5) for share in (0.0, 0.15))
 STARTS = 2
-# the declared kind is wrong if the squares of its error are so many times the least, by a place or not
+# the declared kind is wrong if its squared error is this many times the least, with a place among the two or
+# not
 WRONG_PLACE, WRONG = 2.0, 1.15
 # a kind names a machine only if it leaves no more than this share of the flow's squares
 UNEXPLAINED = 0.4

@@ -20,29 +20,30 @@ from pipeline.deposition.extruder import Extruder, flow, frequency_response
 from pipeline.deposition.learning.trial_filter import Repeating, repeating
 from pipeline.deposition.learning.trial_model import SMOOTHED_HZ, TrialModel, identify_with_lag, lag_delay_s
 
-# of the steady gain squared: only keeps the inverse finite where half
-# a sample of delay makes a zero, far above any Q
+# share of the steady gain squared; it only keeps the inverse finite where half a sample of delay makes a
+# zero, far above any Q
 EPSILON = 1e-9
-# where the inverse of the model's lag amplifies by so much, half of Q is kept: there the lag of a machine of
-# another order is off by a factor of 3 and a quarter of a turn (lags of 0.06 and 0.17 s, taken for 0.84 Hz)
+# half of Q is kept where the inverse of the model's lag amplifies by this. There the lag of a machine of
+# another order is off by a factor of 3 and a quarter of a turn (lags of 0.06 and 0.17 s, identified as 0.84
+# Hz)
 LAG_INVERSE = 10.0
-# no frequency of the learned command has more than this times what the model alone asks for: a machine whose
-# response there is a third of the model's is still learned
+# at no frequency does the learned command have more than this times the amplitude that the model alone would
+# give; so a machine with a third of the model's response there can still be learned
 MOST = 3.0
-# a trial is judged by means over so many samples, and by up to this share its measured flow is scaled to the
-# wanted one: white noise and the scale of one picture repeat in no trial
+# a trial is judged by means over this many samples, and its measured flow is scaled by up to this share to
+# the wanted one, because white noise and the scale of one picture do not repeat from trial to trial
 MEAN_OF, SCALE = 10, 0.02
-# what is left of them, as share of trial 0's error: by so much a trial may be worse than the best
+# the part of them that remains, as share of trial 0's error: a trial may be worse than the best by this much
 NOISE = 0.01
-# the law's share of the step from the best command grows by this on a new best; when it has come down to
-# LITTLE, the best command is sent again, to tell a machine that drifts
+# the law's share of the step from the best command grows by this factor on a new best; at LITTLE or less the
+# best command is sent again, to detect a machine that drifts
 GROWTH, LITTLE = 1.5, 0.25
 # the trials before this one show the law the machine
 FIRST_SHARED = 3
-# a trial that lies within so many standard deviations of the last ones, of so many, has not risen
+# a trial within this many standard deviations of the last ones, of this many, has not risen
 SCATTER, SCATTER_TRIALS = 3.0, 10
-# but beyond so many times the best error it has, however the last ones scatter: a scatter that grows would
-# let the next one grow more
+# but beyond this many times the best error it has risen, however the last ones scatter, because a growing
+# scatter would let the next one grow more
 FAR = 3.0
 # the ink is brought to its yield over this time before flow is wanted, and let down over it afterwards
 YIELD_LEAD_S = 0.4
@@ -93,8 +94,8 @@ def _butterworth(order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarr
 
 
 def zero_phase(x: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
-    """Returns Q x (..., T). The Butterworth low-pass of `order` runs forward and backward, which gives |Q|^2
-    without phase. x counts as zero before and after, because there is no flow then."""
+    """Runs the Butterworth low-pass of `order` forward and backward over x (..., T) and returns Q x (..., T),
+    which is |Q|^2 without phase. x counts as zero before and after, because there is no flow then."""
     sos, pad = _butterworth(order, cutoff_hz, sample_time_s), round(order / cutoff_hz / sample_time_s)
     padded = np.zeros((*x.shape[:-1], x.shape[-1] + 2 * pad))
     padded[..., pad : padded.shape[-1] - pad] = x
@@ -213,7 +214,7 @@ def bounded(x: np.ndarray, learned: np.ndarray, *, sample_time_s: float) -> np.n
     n = scipy.fft.next_fast_len(len(x) + round(1 / sample_time_s), real=True)
     spectra = np.fft.rfft([x, learned], n)
     near = np.ones(max(round(SMOOTHED_HZ * n * sample_time_s), 1))
-    # summed one by one: a running sum loses what is small beside the lowest frequencies
+    # summed one by one, because a running sum loses small values next to the lowest frequencies
     asked, given = (np.sqrt(np.convolve(np.abs(one) ** 2, near, "same")) for one in spectra)
     kept = np.minimum(MOST * asked, given) / np.maximum(given, np.finfo(float).tiny)
     return np.fft.irfft(spectra[1] * kept, n)[: len(x)]
@@ -348,8 +349,8 @@ def actuator_headroom(
     sample_time_s: float,
 ) -> ActuatorHeadroom:
     """Returns the headroom of the drive over the model for r (T,). The least error is that of the nearest
-    flow that the drive can follow, as a share of the error with u0 (T,). Backlash is left out, because it is
-    learned.
+    flow that the drive can follow, as a share of the error with u0 (T,). The drive's backlash is left out,
+    because it is learned.
 
     ramp_s is the longer of the solutions of (1 + tau / t_ramp) steady = amplitude and (1 + tau / t_ramp)
     steady / t_ramp = speed. It is infinite if the amplitude is not above the steady command.

@@ -14,8 +14,8 @@ from pipeline.deposition.learning.trial_model import deviations, unmodelled
 
 # the frequencies of the convergence test reach to half the sampling rate
 FREQUENCIES = 2000
-# an extruder is known to 30 %: what is off by this factor is a unit, a scale or a picture of another size,
-# and the next command would be off as much
+# an extruder is known to 30 %. A gain off by this factor means a wrong unit or scale, or a picture of another
+# size, and the next command would be off by the same factor
 WRONG_GAIN = 3.0
 
 
@@ -199,7 +199,7 @@ def convergence_of_model_inverse(
     (`trial_model.unmodelled`).
     """
     e, law, Ts = sequence.model.extruder, settings.model_inverse, settings.sample_time_s
-    # of the first trials of the machine as it is now the model was identified
+    # the model was identified from the first trials of the machine as it is now
     keep = ilc.state_of(sequence.trials, sequence.routine.r, rise=settings.rise).keep
     first = [sequence.trials[j] for j in keep[: law.identify_trials + 1]]
     u, y = [t.u for t in first], [t.y for t in first]

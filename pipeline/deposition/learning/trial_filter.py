@@ -10,9 +10,10 @@ import scipy.ndimage
 from pipeline.deposition.extruder import pressed
 from pipeline.deposition.learning.trial_model import TrialModel
 
-# ooze is told from noise on the mean flow over this time, which has a fraction of the noise
+# ooze is separated from noise by the mean flow over this time, which has a fraction of the noise
 OOZE_S = 0.5
-# the command moves far after these trials: the disturbance takes them in full, and no gain is told from them
+# the command changes much after these trials, so they count in full for the disturbance, and no gain is
+# estimated from them
 FIRST = 2
 # least weights of a new trial that compete with the law's own
 WEIGHTS = (0.3, 0.6)
@@ -20,8 +21,8 @@ WEIGHTS = (0.3, 0.6)
 FOLLOWERS = ((0.5, 0.0), (0.3, 0.05), (0.5, 0.1))
 # a forecast counts this share of the one after it: about seven trials decide
 MEMORY = 0.85
-# the slow one is left where another's squared forecast error is below this share of its own: noise alone
-# hardly ever gives so much
+# the slow one is replaced if another's squared forecast error is below this share of its own; noise alone
+# hardly ever causes that
 WEIGHT_MARGIN, GAIN_MARGIN = 0.8, 0.5
 # a gain beyond these bounds, as a factor from trial to trial, is a picture that went wrong
 GAIN_BOUNDS = (0.2, 5.0)

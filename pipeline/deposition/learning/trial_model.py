@@ -15,9 +15,9 @@ from pipeline.deposition.extruder import DAMPING, Extruder, flow, pressed
 TIME_CONSTANTS_S = np.geomspace(0.2, 30.0, 12)
 DELAYS_S = np.array([0.0, 0.08, 0.16, 0.3, 0.5])
 LONGEST_DELAY_S = 1.0
-# what is late is part delay, part lag; one trial hardly tells them apart, and then the lag is taken to be
-# near this, give or take this much of its logarithm: a lower one, inverted, pushes far too hard where the
-# machine has none (29 % of trial 0 at trial 1, where this leaves 9 %)
+# lateness is part delay, part lag. One trial hardly separates them, so the lag is assumed near the first
+# value, with this spread of its logarithm. A lower lag, inverted, would push far too hard if the machine has
+# none (29 % of trial 0 at trial 1, where this gives 9 %)
 USUAL_LAG_HZ, LAG_SPREAD, LAG_HZ = 3.0, 0.4, (0.3, 20.0)
 # an extruder of another kind still reaches 60 %; noise alone gives 0
 LEAST_FIT_PERCENT = 20.0
@@ -26,7 +26,7 @@ LEAST_FIT_PERCENT = 20.0
 SMOOTHED_HZ = 0.5
 # the highest frequencies, this share of them, hold white noise alone
 NOISE_SHARE = 0.5
-# a frequency is excited where the simulated flow has this many times the power of the noise
+# a frequency is excited if the simulated flow has this many times the power of the noise there
 EXCITED = 4.0
 
 

@@ -1,5 +1,5 @@
-"""The basis-function composer: a command for any wanted flow as a weighted sum of functions of it, the
-weights and the advance read off the identified chain."""
+"""The basis-function composer: a command for any wanted flow as a weighted sum of functions of it. The
+weights and the advance follow from the identified chain."""
 
 import math
 
@@ -15,21 +15,21 @@ from pipeline.deposition.parts.chain import IdentifiedExtruder, fronts
 # the yield is loaded this long before the flow begins and kept through gaps of twice that: long against the
 # lag, short against a pause between lines
 LOAD_S = 0.25
-# or, where the drive cannot follow that, over so many times as long: below the yield nothing flows
+# or, if the drive cannot follow that, over this many times as long: below the yield nothing flows
 LOADS = (1, 2, 4, 8)
 # dither: slow enough to pass a lag of a few Hz, fast enough that a time constant of
 # seconds leaves some 0.1 % of the steady flow of it
 DITHER_HZ = 2.5
 # and it fades over some cycles: a play left off its middle by a stop would offset the next start
 DITHER_S = 1.0
-# inverse of delay and lag: what lies beyond these seconds is nothing, and where the lag leaves less than
-# FLOOR of the power it is not undone
+# the inverse of delay and lag is cut beyond these seconds, and frequencies at which the lag passes less than
+# FLOOR of the power are not inverted
 SPAN_S, FLOOR = 2.0, 1e-3
 
 
 def boxed(x: np.ndarray, ramp_s: float, sample_time_s: float) -> np.ndarray:
-    """x (T,), held from each sample to the next, after two moving averages of ramp_s, centred, at the
-    samples: a step becomes extruder.ramp.
+    """Returns x (T,), constant from each sample to the next, after two moving averages of ramp_s, centred, at
+    the samples. A step becomes extruder.ramp.
 
     Beyond its ends x counts as 0; the sum is kept.
     """
@@ -39,8 +39,8 @@ def boxed(x: np.ndarray, ramp_s: float, sample_time_s: float) -> np.ndarray:
 
 
 def loaded(r: np.ndarray, margin_s: float, sample_time_s: float) -> np.ndarray:
-    """An on-indicator (T,): 1 while r > 0 and through gaps up to 2 margin_s,
-    rising before and falling after within 2 margin_s."""
+    """Returns an on-indicator (T,): 1 while r > 0 and through gaps up to 2 margin_s, rising before and
+    falling after within 2 margin_s."""
     n = max(1, round(margin_s / sample_time_s))
     near = scipy.ndimage.maximum_filter1d(
         (r > 1e-9 * r.max(initial=0.0)).astype(float), 2 * n + 1, mode="constant"
@@ -51,8 +51,8 @@ def loaded(r: np.ndarray, margin_s: float, sample_time_s: float) -> np.ndarray:
 
 
 def advance(extruder: Extruder | IdentifiedExtruder, sample_time_s: float) -> np.ndarray:
-    """Centred impulse response of conj(H) / (|H|^2 + FLOOR), scaled to gain 1, with H
-    of delay and lags: what comes late is sent ahead."""
+    """Returns the centred impulse response of conj(H) / (|H|^2 + FLOOR), scaled to gain 1, with H of delay
+    and lags. It sends a signal as much earlier as the chain delays it."""
     half = round(SPAN_S / sample_time_s)
     impulse = np.zeros(4 * half)
     impulse[0] = 1.0
@@ -62,13 +62,13 @@ def advance(extruder: Extruder | IdentifiedExtruder, sample_time_s: float) -> np
 
 
 def mean_lag_s(extruder: Extruder | IdentifiedExtruder) -> float:
-    """The mean delay in s of the lags: 2 zeta / w of the second-order one."""
+    """Returns the mean delay in s of the lags: 2 zeta / w of the second-order one plus the second lag."""
     return DAMPING / (math.pi * extruder.lag_hz) + IdentifiedExtruder(*extruder).second_lag_s
 
 
 def shift(extruder: Extruder | IdentifiedExtruder, sample_time_s: float) -> np.ndarray:
-    """Centred impulse response that sends a signal ahead by the delay and the
-    mean delay of the lag, and never beyond its limits."""
+    """Returns the centred impulse response that sends a signal earlier by the delay and the mean delay of the
+    lag, and never beyond its limits."""
     half = round(SPAN_S / sample_time_s)
     late = min((extruder.delay_s + mean_lag_s(extruder)) / sample_time_s, half - 1.0)
     h = np.zeros(2 * half + 1)
@@ -80,7 +80,7 @@ def shift(extruder: Extruder | IdentifiedExtruder, sample_time_s: float) -> np.n
 def compose(
     extruder: Extruder | IdentifiedExtruder, r: np.ndarray, *, sample_time_s: float, drive: Drive = UNLIMITED
 ) -> np.ndarray:
-    """The command u (T,) in mm for the wanted flow r (T,) in mm^3/s, as functions of r and of the
+    """Returns the command u (T,) in mm for the wanted flow r (T,) in mm^3/s, as functions of r and of the
     on-indicator p, with x = r + yield p:
 
         u(t) = advance * [ rate x'(t) + level x(t) + slow <x>(t) + play q(t) sin(2 pi f t) ]
@@ -93,13 +93,15 @@ def compose(
         level = (tau + T - tau T / sigma) / (sigma K)
         level + slow = 1 / K
 
-    Without creep rate = tau / K, level = 1 / K, slow = 0. For an exponent x is the pressed one that gives r;
-    if flow falls otherwise than it rises, tau is that of each sample's direction. Computed in its exact
-    discrete form. The dither is as wide as the play: it walks through the play wherever that stands, so that
-    its mean position is the command's (Zames and Shneydor 1976); q lets it die out after a stop.
+    Without creep rate = tau / K, level = 1 / K, slow = 0. With an exponent x is the pressed value that gives
+    r. If flow falls with another time constant than it rises, tau is that of each sample's direction. It is
+    computed in its exact discrete form. The dither is as wide as the play. It moves through the play from any
+    position, so that its mean position is the command's (Zames and Shneydor 1976); q lets it fade after a
+    stop.
 
-    The yield is loaded over as long as the drive needs. Where it cannot follow u even so, the command whose
-    flow comes nearest: it sets out early and catches up late. What the dither takes is left of the limits.
+    The yield is loaded over as long as the drive needs. If the drive still cannot follow u, the command with
+    the nearest flow is returned: it starts early and catches up late. The limits for it are those that remain
+    after the dither.
     """
     if not np.any(r > 0):
         return np.zeros(len(r))
@@ -120,13 +122,14 @@ def compose(
 
 
 def dither(extruder: Extruder | IdentifiedExtruder, r: np.ndarray, sample_time_s: float) -> np.ndarray:
-    """q(t) sin(2 pi f t) (T,) in mm, as wide as the play; q fades after a stop."""
+    """Returns q(t) sin(2 pi f t) (T,) in mm, as wide as the play; q fades after a stop."""
     fading = extruder.play * loaded(r, DITHER_S, sample_time_s)
     return fading * np.sin(2 * np.pi * DITHER_HZ * sample_time_s * np.arange(len(r)))
 
 
 def _beside(dithered: np.ndarray, ahead: np.ndarray, drive: Drive, sample_time_s: float) -> Drive:
-    """What the dither, sent ahead, leaves of the drive; never less than half of it."""
+    """Returns the limits of the drive that remain beside the dither, sent ahead; never less than half of the
+    drive's."""
     command_mm, speed = demand(scipy.signal.oaconvolve(dithered, ahead, "same"), sample_time_s=sample_time_s)
     return drive._replace(
         amplitude_mm=max(drive.amplitude_mm - command_mm, drive.amplitude_mm / 2),
@@ -135,7 +138,7 @@ def _beside(dithered: np.ndarray, ahead: np.ndarray, drive: Drive, sample_time_s
 
 
 def pressed_of(extruder: IdentifiedExtruder, x: np.ndarray) -> np.ndarray:
-    """p (T,) in mm whose flow without yield is x (T,) >= 0: `chain.flow_of` undone."""
+    """Returns p (T,) in mm whose flow without yield is x (T,) >= 0: the inverse of `chain.flow_of`."""
     if extruder.exponent == 1.0:
         return x / extruder.gain
     full = extruder.gain * extruder.level
@@ -143,14 +146,14 @@ def pressed_of(extruder: IdentifiedExtruder, x: np.ndarray) -> np.ndarray:
 
 
 def _modes(extruder: IdentifiedExtruder, sample_time_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Share and pole of the fast and of the creeping mode: each is
-    m(t+1) = pole m(t) + share v(t), and p their sum."""
+    """Returns share and pole of the fast and of the creeping mode. Each is m(t+1) = pole m(t) + share v(t),
+    and p is their sum."""
     poles = np.exp(-sample_time_s / np.array([extruder.time_constant_s, extruder.creep_time_s]))
     return np.array([1 - extruder.creep_share, extruder.creep_share]) * (1 - poles), poles
 
 
 def _inverse(extruder: IdentifiedExtruder, p: np.ndarray, sample_time_s: float) -> np.ndarray:
-    """v (T,), held between samples, that brings both modes together to p at every next sample."""
+    """Returns v (T,), constant between samples, for which the sum of both modes is p at every next sample."""
     (g, h), (a, b) = _modes(extruder, sample_time_s)
     if extruder.fall_ratio == 1.0:
         v = scipy.signal.lfilter(np.convolve([1.0, -a], [1.0, -b]), [g + h, -g * b - h * a], p)
@@ -172,8 +175,8 @@ def _inverse(extruder: IdentifiedExtruder, p: np.ndarray, sample_time_s: float) 
 def reached(
     extruder: Extruder | IdentifiedExtruder, v: np.ndarray, r: np.ndarray, drive: Drive, sample_time_s: float
 ) -> np.ndarray:
-    """v (T,) that the drive can follow whose fast mode comes nearest to that of the unlimited v; where no
-    flow r (T,) is wanted only what rises above the yield costs. Delay and lag lie before v."""
+    """Returns v (T,) that the drive can follow and whose fast mode is nearest to that of the unlimited v.
+    Where no flow r (T,) is wanted, only what rises above the yield costs. Delay and lag act before v."""
     extruder = IdentifiedExtruder(*extruder)
     (share, creeping), (a, b) = _modes(extruder, sample_time_s)
     g, h = share * extruder.gain, creeping * extruder.gain

@@ -40,27 +40,27 @@ class IdentifiedExtruder(NamedTuple):
 # ratio, second lag, ln exponent; play and yield in shares of the steady command and flow
 LOW = np.array([math.log(1e-3), math.log(0.05), 0.0, 0.0, 0.0, 0.0, 0.0, math.log(5.0), -1.0, 0.0, -1.0])
 HIGH = np.array([math.log(1e3), math.log(100.0), 1.0, 3.0, 0.3, 0.5, 0.5, math.log(200.0), 1.0, 0.8, 1.0])
-# steps of the Jacobian, small against what a trial can tell and large against rounding
+# steps of the Jacobian, small against the resolution of a trial and large against rounding
 STEP = np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-3, 1e-3, 2e-3, 1e-2, 1e-3, 2e-3, 1e-3])
-# what every chain has, and what it may have beside it: each kept only where trials left out prefer it
+# the unknowns of every chain, and the extras, each of which is kept only if left-out trials prefer it
 ALWAYS = (0, 1, 2, 4, 5)
 EXTRAS = {"creep": (6, 7), "fall": (8,), "second_lag": (9,), "exponent": (10,)}
-# the second-order lag, which is left away where rows left out do not miss it
+# the second-order lag, which is removed unless left-out rows prefer it
 LAG, LAG_AT = "lag", 3
 AVERAGE_S = 0.2
 # a measured flow wanders from trial to trial: changes slower than this
 # are trusted less than white noise would be
 DRIFT_S = 4.0
-# chains that the trials cannot tell from the identified one: a power of two
+# number of chains that the trials cannot tell from the identified one: a power of two
 MEMBERS = 32
-# below so many rows a walk in plain numbers is faster than one in arrays
+# for fewer rows a loop over plain numbers is faster than one over arrays
 FEW_ROWS = 48
-# an extra is kept where the squared innovations of routines left out fall by this share, some fifty times
-# what a useless one takes of white noise, and fall in so many of the routines
+# an extra is kept if the squared innovations of left-out routines fall by this share, some fifty times the
+# effect of a useless extra on white noise, and fall in this share of the routines
 MARGIN, AGREE = 0.002, 0.75
-# steps of a fit that sets out from the fit to all rows
+# steps of a fit that starts from the fit to all rows
 REFITS = 3
-# a chain whose squared innovations are so many times the least is one that the trials can tell
+# a chain with more than this many times the least squared innovations can be told from the best by the trials
 UNLIKELY = 1.05
 
 
@@ -70,9 +70,9 @@ class Chain(NamedTuple):
     `residual_percent`: r.m.s. of measured minus simulated flow over all trials; `held_out_percent`: r.m.s.
     error on learned trials of routines that the fit did not see, of means over AVERAGE_S; both in % of the
     steady flow. `structure`: the effects that were kept in addition to gain, time constant, delay, play and
-    yield. `left_out`: the fits without one routine each (without one trial each if there is only one
-    routine), in their order; `members`: the fits that the trials cannot tell from the best. `trials`: number
-    of trials used; `rows`: number of rows (`records`).
+    yield. `left_out`: the fits without one routine each (without one row each if there is only one routine),
+    in their order; `members`: the fits that the trials cannot tell from the best. `trials`: number of trials
+    used; `rows`: number of rows (`records`).
     """
 
     extruder: IdentifiedExtruder

@@ -262,8 +262,8 @@ def superposition(
     *,
     samples: int,
 ) -> np.ndarray:
-    """Returns u (T,): the steady level plus every task's deviation from it. Tasks that overlap both count,
-    because the extruder is nearly linear."""
+    """Returns u (T,): the steady level plus every task's deviation from the command without it
+    (`background`). Tasks that overlap both count, because the extruder is nearly linear."""
     u = _steady(library, material, nozzle_mm, lines, tool, samples)
     levels = {still.speed: float(still.signal[0]) for still in of_task(library, STEADY, material, nozzle_mm)}
     for name in (CORNER, START, STOP):

@@ -1,5 +1,5 @@
-"""Will this part print? Predicted volume of every printed line, runs shorter than the Stop lead, what the
-drive's limit costs, and what was refused, by line number."""
+"""Will this part print? By line number: the predicted volume of every printed line, runs shorter than the
+Stop lead, the cost of the drive's limit, and what was refused."""
 
 import math
 from typing import NamedTuple
@@ -42,11 +42,13 @@ class LineVolumes(NamedTuple):
 
 
 class Saturation(NamedTuple):
-    """What a drive does to one flow with one ramp: its limits (inf where there is none) and beside them the
-    largest unlimited command (mm) and its speed (mm/s); peak of that command over the steady one, share of
-    the printing time at a limit, and r.m.s. error of the composed command within them in % of that of on-off
-    control r / on_off_gain; least_percent is that of the nearest flow that the drive can reach, and enough
-    whether the drive adds at most `reachable.LOSS` of on-off's to the error of the unlimited command."""
+    """The effect of a drive on one flow with one ramp. `amplitude_mm`, `speed_mm_per_s`: its limits (inf
+    without a limit); `largest_command_mm`, `largest_speed_mm_per_s`: of the unlimited command;
+    `peak_over_steady`: peak of that command over the steady one; `share_percent`: share of the printing time
+    at a limit; `rms_percent_of_on_off`: r.m.s. error of the composed command within the limits, in % of that
+    of on-off control r / on_off_gain; `least_percent`: the same of the nearest flow that the drive can reach;
+    `enough`: whether the drive adds at most `reachable.LOSS` of on-off's error to that of the unlimited
+    command."""
 
     ramp_s: float
     amplitude_mm: float
@@ -61,9 +63,9 @@ class Saturation(NamedTuple):
 
 
 class Conformance(NamedTuple):
-    """The report on a part: its lines, the worst error in % among the `judged` lines of at least shortest_s,
-    for each tool the saturation with the ramp as it is, and what was refused; if the drive does not follow,
-    the ramp of the gantry in s with which it would (inf where none does)."""
+    """The report on a part: its lines; the worst error in % among the `judged` lines of at least shortest_s;
+    for each tool the saturation with the present ramp; and what was refused. If the drive does not follow,
+    also the ramp of the gantry in s with which it would (inf if there is none)."""
 
     lines: LineVolumes
     worst_line_volume_percent: float
@@ -84,9 +86,9 @@ def conform(
     largest_error_percent: float,
     least_mm3: float = 0.0,
 ) -> Conformance:
-    """Whether the part will print: line volumes, saturation, and tasks whose signal the library only guesses
-    (predicted error above largest_error_percent, or unknown), where the library's signals are used. Lines of
-    less than least_mm3 get no percent: for a dot it means nothing."""
+    """Returns whether the part will print: line volumes, saturation, and refusals of tasks whose signal the
+    library only guesses (predicted error above largest_error_percent, or unknown), if the library's signals
+    are used. Lines of less than least_mm3 get no percent, because it means nothing for a dot."""
     lines = line_volumes(composed, learned.library, bead_area_mm2=bead_area_mm2)
     error = np.where(lines.planned_mm3 >= least_mm3, lines.error_percent, np.nan)
     lines = _intervals(lines, composed)._replace(error_percent=error)
@@ -120,7 +122,8 @@ def conform(
 
 
 def _intervals(lines: LineVolumes, composed: Composed) -> LineVolumes:
-    """The lines with the 90 % interval of each one's volume, of what the streams' forecasts may come to."""
+    """Returns the lines with the 90 % interval of each one's volume, from the possible flows of the streams'
+    forecasts."""
     low, high = lines.low_percent.copy(), lines.high_percent.copy()
     for stream in composed.streams:
         material = stream.learned
@@ -139,8 +142,8 @@ def _intervals(lines: LineVolumes, composed: Composed) -> LineVolumes:
 
 
 def reaches(composed: Composed, tool: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The lines of a tool, and from when to when in s the flow is theirs: to the middles of the gaps to
-    their neighbours, at most REACH_S from their ends."""
+    """Returns the lines of a tool, and the times in s from and until which the flow counts for each: to the
+    middles of the gaps to its neighbours, at most REACH_S beyond its ends."""
     mine = np.flatnonzero(composed.lines.tool == tool)
     a, b = composed.lines.begin_s[mine], composed.lines.end_s[mine]
     middle = (b[:-1] + a[1:]) / 2
@@ -150,8 +153,8 @@ def reaches(composed: Composed, tool: int) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def line_volumes(composed: Composed, library: Library, *, bead_area_mm2: float) -> LineVolumes:
-    """A row for each printed line, in their order: the flow between the middles of the gaps to its neighbours
-    of the same tool, at most REACH_S from its ends."""
+    """Returns a row for each printed line, in their order. Its volume is the flow between the middles of the
+    gaps to its neighbours of the same tool, at most REACH_S beyond its ends."""
     lines, Ts = composed.lines, composed.sample_time_s
     begin = np.bincount(lines.run, weights=np.where(lines.first, lines.begin_s, 0.0))
     run_s = np.bincount(lines.run, weights=np.where(lines.last, lines.end_s, 0.0)) - begin
@@ -181,8 +184,8 @@ def line_volumes(composed: Composed, library: Library, *, bead_area_mm2: float) 
 def volume_between(
     flow: np.ndarray, start: np.ndarray, stop: np.ndarray, *, sample_time_s: float
 ) -> np.ndarray:
-    """Volume (L,) in mm^3 that a flow (T,), linear between its samples, presses out from start (L,) to stop
-    (L,), in s; none before the first and after the last."""
+    """Returns the volume (L,) in mm^3 that a flow (T,), linear between its samples, presses out from start
+    (L,) to stop (L,), in s; none before the first sample and after the last."""
     t = np.arange(len(flow)) * sample_time_s
     total = np.append(0.0, np.cumsum((flow[1:] + flow[:-1]) / 2)) * sample_time_s
     return np.interp(stop, t, total) - np.interp(start, t, total)
@@ -197,8 +200,8 @@ def saturation(
     drive: Drive,
     sample_time_s: float,
 ) -> Saturation:
-    """What the drive does to the wanted flow (T,) with its steps
-    shaped by two boxes of ramp_s: forecast by the chain."""
+    """Returns the effect of the drive on the wanted flow (T,) with its steps shaped by two boxes of ramp_s,
+    as forecast by the chain."""
     r = basis.boxed(unshaped, ramp_s, sample_time_s)
     r[r < 1e-9 * r.max(initial=0.0)] = 0.0  # rounding of the sums behind the rate
     free = basis.compose(extruder, r, sample_time_s=sample_time_s)

@@ -1,5 +1,5 @@
-"""Every composer on one part, beside on-off control and full-part ILC; judged by the true flow of the
-machine, on a real one by the forecast."""
+"""Compares every composer on one part with on-off control and full-part ILC. They are judged by the true flow
+of a simulated machine, or by the forecast for a real one."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,8 +19,8 @@ ON_OFF, FULL_PART_ILC = "on_off", "ilc"
 
 class ComposerScore(NamedTuple):
     """One composer on one stream: r.m.s. error of its flow y (T,) in % of on-off control's, as judged and as
-    predicted beforehand (NaN where nothing predicts it), and the largest error of a printed line's volume in
-    % (NaN where no line is long enough)."""
+    predicted beforehand (NaN without a prediction), and the largest error of a printed line's volume in %
+    (NaN if no line is long enough, or if the forecast of a real machine may not be believed)."""
 
     stream: int
     composer: str
@@ -42,9 +42,9 @@ class Learning(NamedTuple):
 
 
 class Judging(NamedTuple):
-    """What composers are judged by: the nominal and the true extruders by material, the latter empty where
-    there is only a real machine; the laws' settings and the noise; the updates of full-part ILC; the bead's
-    area, and the shortest line whose volume counts."""
+    """The data for judging composers: the nominal and the true extruders by material, the latter empty for a
+    real machine; the laws' settings and the noise; the updates of full-part ILC; the bead's area, and the
+    duration of the shortest line whose volume counts."""
 
     nominals: dict[str, Extruder]
     plants: dict[str, Extruder]
@@ -62,13 +62,13 @@ def evaluate(
     judging: Judging,
     rng: np.random.Generator,
 ) -> tuple[list[ComposerScore], list[Learning]]:
-    """Scores of all composers on all streams; and on a simulated machine the error of full-part ILC after
-    each of its prints.
+    """Returns the scores of all composers on all streams and, on a simulated machine, the error of full-part
+    ILC after each of its prints.
 
-    On a real machine nobody knows the true flow: a composer scores the upper end of its forecast, its flow is
-    the chain's, and full-part ILC is left out. The worst line of the chosen composer is the farther end of
-    its interval in `lines`, for the flow of the chain that made the command is no measure of it; there is
-    none if the forecast may not be believed.
+    The true flow of a real machine is unknown. There a composer's score is the upper end of its forecast, its
+    flow is the chain's, and full-part ILC is left out. The worst line of the chosen composer is then the
+    farther end of its interval in `lines`, because the chain that made the command cannot measure its error.
+    It is NaN if the forecast may not be believed.
     """
     scores, course, Ts, drive = [], [], judging.laws.sample_time_s, judging.laws.drive
     ends = np.maximum(np.abs(lines.low_percent), np.abs(lines.high_percent))
@@ -107,8 +107,8 @@ def evaluate(
 def learned_from(
     learned: LearnedLibrary, composed: Composed, judging: Judging, prints: Sequence[int]
 ) -> list[Learning]:
-    """The true error of every composer on every stream of a part that was composed by what fewer trials
-    taught; `prints` of each stream's material."""
+    """Returns the true error of every composer on every stream of a part that was composed after fewer
+    trials; `prints` are those of each stream's material."""
     rows = []
     for i, (stream, count) in enumerate(zip(composed.streams, prints, strict=True)):
         plant = judging.plants[stream.material]
@@ -122,14 +122,14 @@ def learned_from(
 def _commands(
     learned: LearnedLibrary, composed: Composed, stream: Stream, judging: Judging
 ) -> dict[str, np.ndarray]:
-    """The command (T,) of on-off control, by the gain known beforehand, and of every composer."""
+    """Returns the command (T,) of on-off control, by the gain known beforehand, and of every composer."""
     laws, gain = judging.laws, judging.nominals[stream.material].gain
     on_off = obeyed(stream.r / gain, laws.drive, sample_time_s=laws.sample_time_s)
     return {ON_OFF: on_off} | commands(learned, composed, stream, drive=laws.drive)
 
 
 def _true_error(plant: Extruder, u: np.ndarray, stream: Stream, judging: Judging) -> float:
-    """The norm of the true flow's error under the command u (T,), mm^3/s."""
+    """Returns the norm of the true flow's error for the command u (T,), mm^3/s."""
     laws = judging.laws
     y = flow(plant, u, sample_time_s=laws.sample_time_s, drive=laws.drive)
     return float(np.linalg.norm(y - stream.r))
@@ -138,8 +138,8 @@ def _true_error(plant: Extruder, u: np.ndarray, stream: Stream, judging: Judging
 def _full_part_ilc(
     plant: Extruder, nominal: Extruder, stream: Stream, judging: Judging, rng: np.random.Generator
 ) -> list[np.ndarray]:
-    """The command after each of `updates` trials of the full part, and after the first print with on-off
-    control, by the inverse of the identified model."""
+    """Returns the command after the first print with on-off control and after each of `updates` trials of the
+    full part, by the inverse of the identified model."""
     laws = judging.laws
     t = np.arange(len(stream.r)) * laws.sample_time_s
     part = Routine(t, stream.r, np.zeros(len(t)), np.zeros(len(t)), stream.r > 0, 0.0, (0.0, 0.0), 0.0)
@@ -152,8 +152,8 @@ def _full_part_ilc(
 
 
 def _off(composed: Composed, tool: int, y: np.ndarray, judging: Judging) -> np.ndarray:
-    """By how much in % the volume of each line (L,) is off under the flow y (T,) of its tool; NaN for the
-    lines of others."""
+    """Returns by how much in % the volume of each line (L,) is off with the flow y (T,) of its tool; NaN for
+    lines of other tools."""
     mine, start, stop = reaches(composed, tool)
     planned, off = judging.bead_area_mm2 * composed.lines.length, np.full(len(composed.lines.line), np.nan)
     made = volume_between(y, start, stop, sample_time_s=composed.sample_time_s)

@@ -18,24 +18,26 @@ from pipeline.deposition.parts.chain import Chain, IdentifiedExtruder, simulate
 from pipeline.deposition.parts.library import Training
 from pipeline.deposition.toolpath.tasks import PrintedLines
 
-# a sample belongs to the last event: to Start or Stop this long after it, to a Corner, a gap of at most this,
-# so long after flow is wanted again
+# a sample belongs to the last event: to a Start or Stop for this long after it; to a Corner, which is a gap
+# of at most this length, until this long after flow is wanted again
 NEAR_S = 1.0
 # an event begins this long ahead of its middle, as its ramp does; bins of the time since it
 AHEAD_S, BIN_S = 0.2, 0.2
 EVENTS = START, CORNER, STOP, STEADY, OFF = range(5)
 NAMES = ("start", "corner", "stop", "steady", "off")
 BINS = 12
-# a model that misses more than this on routines left out, in % of on-off control's error, makes no forecast:
-# the limit of the rule "Flow error" as params.yaml comes. Change and ripple widen the interval, up to so much
+# a model that misses more than this on left-out routines, in % of on-off control's error, makes no forecast;
+# this is the default limit of the rule "Flow error" in params.yaml. Change and ripple widen the interval, up
+# to the second limit
 LIMIT_PERCENT, MOVES_PERCENT = 6.0, 10.0
-# a forecast is for so many prints, during which a machine that changes goes on to do so
+# a forecast is for this many prints, during which a machine that changes continues to change
 PRINTS = 10
-# a flow ripples if it varies within so many s; a machine has come to rest so long after an event
+# a flow ripples if it varies within the first time; a machine is at rest the second time after an event (s)
 RIPPLE_S, SETTLED_S = 2.5, 1.0
-# a part may ask for this much more or less than was trained, and for runs so many times as long
+# a part may exceed the trained range by this factor, and its runs may be this many times as long
 BEYOND, LONGER = 1.25, 3.0
-# of the residual a member carries none, all, or twice: a part excites other shares of it than the routines
+# a member carries none, all, or twice of the residual, because a part excites other shares of it than the
+# routines
 CARRIED = (0.0, 1.0, 2.0)
 # ends and middle of the members' errors: the largest, of members that carry twice the residual, order
 # composers worse than the ninth decile does
@@ -45,13 +47,13 @@ LONG, FEW = 30_000, 16
 
 # the flow is unsure as a whole over this; of each event the hardest, with the runs that hang together with it
 SPREAD_S, WINDOW_S = 0.4, 6.0
-# off between two windows, and so much of a line longer than twice as long is left away in its middle
+# pause between two windows; a line longer than twice PLATEAU_S keeps only PLATEAU_S at each end
 REST_S, PLATEAU_S = 3.0, 3.0
-# the track is turned after so many mm, on the next line so far beside it
+# the track turns back after this many mm, on a line this far beside the last one
 TRACK_MM, BESIDE_MM = 100.0, 5.0
 # a pause shorter than this is none
 SHORTEST_S = 0.005
-# of what a print lacked so much is learned at once, below so many Hz
+# this share of the flow that a print lacked is learned at once, below this frequency
 SHARE, CUTOFF_HZ, ORDER = 0.5, 2.0, 2
 FILAMENT_MM2 = math.pi * 1.75**2 / 4
 
@@ -61,8 +63,9 @@ class Missed(NamedTuple):
     measured, in shares of the local flow. Three sizes are in % of the error of the first trials, which are
     on-off control, each without the share of noise: `held_out_percent`, the whole error, most of it at
     `event`; `change_percent`, the change of the level from the mean of the trials to the last of the next
-    PRINTS; `ripple_percent`, the ripple that differs from trial to trial. They are NaN if fewer than three
-    trials with learned commands do not show the noise. `level_percent` is the change in % of the flow."""
+    PRINTS; `ripple_percent`, the ripple that differs from trial to trial. `level_percent` is the change in %
+    of the flow. Error and change are NaN if there are fewer than three trials with learned commands, because
+    these do not show the noise."""
 
     by_place: np.ndarray
     held_out_percent: float

@@ -1,5 +1,6 @@
-"""Plunger commands -> G-code with leads: the plunger's place written along the gantry's way, so that it is
-primed ahead of each line and let back ahead of its end, by a machine that plays no signal."""
+"""Plunger commands -> G-code with leads, for a machine that cannot play a signal: the plunger's place is
+written along the gantry's way, so that the plunger is primed before each line begins and released before it
+ends."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -21,9 +22,9 @@ ROWS = 1 << 15
 
 
 class Legs(NamedTuple):
-    """K legs in their order: the tool in use, where the gantry ends (K, 3) in mm, the plunger's place at
-    that end in mm, the seconds that the leg takes, and whether it is a change to its tool, which takes the
-    machine's own time. lost_mm is the largest command of a tool while another one is in use."""
+    """K legs in their order: the tool in use, the gantry's place at the end (K, 3) in mm, the plunger's place
+    there in mm, the duration of the leg in s, and whether it is a change to its tool, which takes the
+    machine's own time. `lost_mm`: the largest command of a tool while another one is in use."""
 
     tool: np.ndarray
     position: np.ndarray
@@ -43,11 +44,11 @@ def legs(
     tolerance_mm: float,
     speeds: bool = False,
 ) -> Legs:
-    """Legs that follow the commands u (T,) of each tool, or, if these are speeds in mm/s, the place that all
-    tools have gone, linear between their samples, within tolerance_mm,
-    and the gantry's path exactly but for arcs, which get a leg a sample; along it the gantry is within WAY_MM
-    of where it is planned at that time, so that a long ramp is several legs of rising feed. The gantry sets
-    out lead_in_s behind the first sample."""
+    """Returns legs that follow the commands u (T,) of each tool, linear between samples, within tolerance_mm.
+    If the commands are speeds in mm/s, the legs follow the place that all tools have gone together. The
+    gantry's path is exact except for arcs, which get a leg per sample. The gantry is within WAY_MM of its
+    planned place at any time, so a long ramp becomes several legs of rising feed. The gantry starts lead_in_s
+    after the first sample."""
     Ts, n = sample_time_s, max(len(u) for u in commands.values())
     changes = np.flatnonzero(moves.kind == Kind.TOOL)
     begins, ends = lead_in_s + motion.begin_s, lead_in_s + motion.begin_s + motion.duration_s
@@ -79,13 +80,14 @@ def legs(
 
 
 def _way(position: np.ndarray, ahead: int, n: int) -> np.ndarray:
-    """The way (n,) in mm that the gantry has gone, place by place (P, 3), at the samples of the commands."""
+    """Returns the way (n,) in mm that the gantry has gone along its places (P, 3), at the samples of the
+    commands."""
     gone = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1)))
     return gone[np.clip(np.arange(n) - ahead, 0, len(gone) - 1)]
 
 
 def _places(moves: Moves, time_s, begins, ends, signal, ahead: int, Ts: float) -> np.ndarray:
-    """The gantry's place (K, 3) at times that are samples of its signal or ends of its moves."""
+    """Returns the gantry's place (K, 3) at times that are samples of its signal or ends of its moves."""
     k = np.clip(np.rint(time_s / Ts).astype(int) - ahead, 0, len(signal.time_s) - 1)
     place = signal.position[k]
     done = np.searchsorted(ends, time_s + 1e-9, side="right") - 1  # the last move that is over
@@ -96,8 +98,8 @@ def _places(moves: Moves, time_s, begins, ends, signal, ahead: int, Ts: float) -
 
 
 def bends(u: np.ndarray, tolerance: float) -> np.ndarray:
-    """Indices (K,) of samples, the first and the last among them, between which straight lines stay within
-    `tolerance` of u (T,): each line as long as the cone of slopes from its start allows."""
+    """Returns the indices (K,) of samples, with the first and the last, between which straight lines are
+    within `tolerance` of u (T,). Each line is as long as the cone of slopes from its start allows."""
     kept, start, last, low, high = [0], 0, 0, -np.inf, np.inf
     flat = np.flatnonzero(np.append(True, np.abs(np.diff(u)) > 0))  # runs of equal values have two ends
     inner = np.union1d(flat, np.append(np.maximum(flat - 1, 0), len(u) - 1))
@@ -124,9 +126,9 @@ def lines(
     sample_time_s: float,
     speeds: bool = False,
 ) -> Iterator[str]:
-    """The part, line by line, as G-code whose E, or another letter, is the plunger's place, or what was
-    pushed if the commands are speeds, so that it primes ahead of each line and lets back ahead of its end;
-    what no program can hold stands in its head. Parameters as of `legs`."""
+    """Yields the part, line by line, as G-code. E, or another letter, is the plunger's place, or the pushed
+    amount if the commands are speeds, so that the plunger primes before each line and releases before its
+    end. What no program can hold is noted in its head. Parameters as in `legs`."""
     largest = max(float(np.abs(u).max()) for u in commands.values())
     found = legs(
         moves, motion, commands, lead_in_s=lead_in_s, sample_time_s=sample_time_s,
@@ -146,9 +148,9 @@ def lines(
 
 
 def program(found: Legs, *, letter: str = "E", goes_on: bool = False) -> Iterator[str]:
-    """The legs as lines of G-code in mm, absolute: G1 with the plunger's place behind `letter`, the feed that
-    makes the leg last as long as planned; G4 where nothing moves. If it goes on, a tool begins where the one
-    before it ended."""
+    """Yields the legs as lines of G-code in mm, absolute: G1 with the plunger's place after `letter` and the
+    feed for which the leg lasts as planned; G4 if nothing moves. If `goes_on`, a tool begins at the place
+    where the previous tool ended."""
     held, wait, tool = [0.0] * 4, 0.0, None
     yield from ("G21", "G90", "M82")
     for each, position, u, seconds, change in zip(*map(_each, found[:5]), strict=True):
@@ -163,7 +165,7 @@ def program(found: Legs, *, letter: str = "E", goes_on: bool = False) -> Iterato
         if not any(step):
             wait += seconds
             continue
-        # with X, Y or Z the feed is that of the path, else that of the plunger
+        # with X, Y or Z the feed is that of the path, without them that of the plunger
         way = math.hypot(*step[:3]) or abs(step[3])
         words = [f"{c}{x:.9g}" for c, x, d in zip(("X", "Y", "Z", letter), to, step, strict=True) if d]
         yield from (*_waited(wait), f"G1 {' '.join(words)} F{60 * way / seconds:.6g}")
@@ -172,7 +174,8 @@ def program(found: Legs, *, letter: str = "E", goes_on: bool = False) -> Iterato
 
 
 def _each(column: np.ndarray) -> Iterator[Any]:
-    """Its rows as Python's numbers, made a part at a time: they take eight times the memory."""
+    """Yields its rows as Python's numbers, made a part at a time, because they take eight times the
+    memory."""
     for at in range(0, len(column), ROWS):
         yield from column[at : at + ROWS].tolist()
 

@@ -14,7 +14,7 @@ from pipeline.deposition.learning.ilc import repeating_error
 # in the order of the hierarchy (fig. 7): the first that is active rules
 TASKS = ("Stop", "Start", "Corner", "Steady-State", "No-Flow")
 STOP, START, CORNER, STEADY, NO_FLOW = TASKS
-# a signal has settled when it stays within the threshold this long: longer than it takes to cross a level
+# a signal has settled if it is within the threshold for this long: longer than it takes to cross a level
 HOLD_S = 0.1
 
 

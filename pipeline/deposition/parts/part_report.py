@@ -1,4 +1,4 @@
-"""What is reported of composed parts: tables, the conformance report, figures, and the summary in words."""
+"""Reports composed parts: tables, the conformance report, figures, and the summary in words."""
 
 import math
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ LONGEST_LIST = 12  # refusals and words in the summary
 
 
 def summary_lines(part: ComposedPart) -> str:
-    """The conformance report in words, line by line."""
+    """Returns the conformance report in words, line by line."""
     checks, composed = part.conformance, part.composed
     lines, text = checks.lines, []
     duration = len(composed.streams[0].u) * composed.sample_time_s
@@ -76,8 +76,8 @@ def summary_lines(part: ComposedPart) -> str:
 
 
 def _program_lines(part: ComposedPart) -> list[str]:
-    """What the program drives and what E asks for beside the declared bead; words that are no moves, each
-    reported once."""
+    """Returns in words what the program drives, E's volume compared with the declared bead, and the words
+    that are no moves, each reported once."""
     program, by = part.program, part.program.accounted
     text = [
         f"{program.lines:,} lines of the program: {by.moved:,} move, {by.read:,} set or repeat, {by.other:,} "
@@ -106,8 +106,8 @@ def _volume_source(why: str) -> str:
 
 
 def grouped(report: Conformance, refusals: Sequence[LineRefusal]) -> list[LineRefusal]:
-    """What was not composed as it stands, by kind, each with its first line and how many there are: what
-    the report refuses, and what the reader did."""
+    """Returns what was not composed as written, by kind, each with its first line and the number of lines:
+    the refusals of the report, and those of the reader."""
     kinds = Refusals()
     for one in report.refused:
         kinds.add([one.line], one.why)
@@ -115,7 +115,8 @@ def grouped(report: Conformance, refusals: Sequence[LineRefusal]) -> list[LineRe
 
 
 def forecast_sentence(composed: Composed, stream: Stream) -> str:
-    """The forecast of each composer in words, the least upper end first, or why it is not judged."""
+    """Returns the forecast of each composer in words, the lowest upper end first, or why there is no valid
+    forecast."""
     intervals = sorted(
         (q for q in composed.predictions if q.tool == stream.tool), key=lambda prediction: prediction.high
     )
@@ -130,7 +131,7 @@ def forecast_sentence(composed: Composed, stream: Stream) -> str:
 
 
 def signal_rows(part: ComposedPart, scores: Sequence[ComposerScore]) -> dict[str, np.ndarray]:
-    """One row a sample of every stream, the gantry beside it, and the flow of every composer."""
+    """Returns one row per sample of every stream, with the gantry's place and the flow of every composer."""
     composed = part.composed
     Ts, ahead = composed.sample_time_s, round(composed.lead_in_s / composed.sample_time_s)
     position = motion.sampled(part.planned, part.program.moves, sample_time_s=Ts).position
@@ -152,21 +153,21 @@ def signal_rows(part: ComposedPart, scores: Sequence[ComposerScore]) -> dict[str
 
 
 def score_rows(part: ComposedPart, scores: Sequence[ComposerScore]) -> dict[str, list]:
-    """One row a composer of every stream."""
+    """Returns one row per composer of every stream."""
     columns = {name: [getattr(score, name) for score in scores] for name in ComposerScore._fields[1:6]}
     materials = [part.composed.streams[score.stream].material for score in scores]
     return {"part": [part.name] * len(scores), "material": materials} | columns
 
 
 def print_rows(part: ComposedPart, learning: Sequence[Learning]) -> dict[str, list]:
-    """One row a composer of every stream of a part, after each number of prints."""
+    """Returns one row per composer of every stream of a part, after each number of prints."""
     columns = {name: [getattr(one, name) for one in learning] for name in Learning._fields[1:]}
     materials = [part.composed.streams[one.stream].material for one in learning]
     return {"part": [part.name] * len(learning), "material": materials} | columns
 
 
 def task_rows(part: ComposedPart) -> dict[str, np.ndarray]:
-    """One row a task."""
+    """Returns one row per task."""
     tasks = part.composed.tasks
     return {
         "part": np.full(len(tasks.task), part.name, object),
@@ -177,13 +178,13 @@ def task_rows(part: ComposedPart) -> dict[str, np.ndarray]:
 
 
 def line_rows(part: ComposedPart) -> dict[str, np.ndarray]:
-    """One row a printed line."""
+    """Returns one row per printed line."""
     lines = part.conformance.lines
     return {"part": np.full(len(lines.line), part.name, object)} | lines._asdict()
 
 
 def rows(judged: Sequence[tuple[ComposedPart, Sequence[ComposerScore]]]) -> dict[str, dict[str, np.ndarray]]:
-    """Columns of the tables signals, scores, tasks and lines of all parts."""
+    """Returns the columns of the tables signals, scores, tasks and lines of all parts."""
     return {
         "signals": stacked([signal_rows(*one) for one in judged]),
         "scores": stacked([score_rows(*one) for one in judged]),
@@ -193,12 +194,12 @@ def rows(judged: Sequence[tuple[ComposedPart, Sequence[ComposerScore]]]) -> dict
 
 
 def stacked(tables: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Tables of equal columns, one below the other."""
+    """Returns tables of equal columns, one below the other."""
     return {name: np.concatenate([np.asarray(table[name]) for table in tables]) for name in tables[0]}
 
 
 def report(part: ComposedPart) -> dict[str, Any]:
-    """The conformance report of a part, as JSON."""
+    """Returns the conformance report of a part, as JSON."""
     checks, composed = part.conformance, part.composed
     lines = checks.lines
     return {
@@ -233,7 +234,7 @@ def report(part: ComposedPart) -> dict[str, Any]:
 
 
 def program_report(program: PartProgram, extruded: Extruded, *, bead_area_mm2: float) -> dict[str, Any]:
-    """What the program holds and what E asks for beside the declared bead, as JSON."""
+    """Returns the contents of the program and E's volume compared with the declared bead, as JSON."""
     differences = extrusion.differences(program.moves, extruded, bead_area_mm2=bead_area_mm2)
     return {
         "lines": program.accounted._asdict(),
@@ -246,8 +247,8 @@ def program_report(program: PartProgram, extruded: Extruded, *, bead_area_mm2: f
 
 
 def figures(judged: Sequence[tuple[ComposedPart, Sequence[ComposerScore]]]) -> dict[str, Any]:
-    """By part, material and composer: the error of the true flow in % of on-off
-    control's, the worst line's volume, and which was chosen; and what its command asks of the drive."""
+    """Returns by part, material and composer: the error of the true flow in % of on-off control's, the worst
+    line's volume, and which was chosen; also what its command demands of the drive."""
     return {
         part.name: {
             stream.material: _by_composer([score for score in scores if score.stream == i])
@@ -261,7 +262,7 @@ def figures(judged: Sequence[tuple[ComposedPart, Sequence[ComposerScore]]]) -> d
 
 
 def forecast_of(composed: Composed, stream: Stream) -> dict[str, Any]:
-    """Forecast error of the signal as it is sent, in % of on-off control's, and whether it may be
+    """Returns the forecast error of the signal as it is sent, in % of on-off control's, and whether it may be
     believed."""
     chosen = next(q for q in composed.predictions if q.tool == stream.tool and q.chosen)
     return {
@@ -277,7 +278,7 @@ def forecast_of(composed: Composed, stream: Stream) -> dict[str, Any]:
 
 
 def _forecast(composed: Composed, stream: Stream, scores: Sequence[ComposerScore]) -> dict[str, Any]:
-    """The forecast beside the true error, which a simulated machine has, and whether it may be believed."""
+    """Returns the forecast, whether it may be believed, and the true error if the machine is simulated."""
     forecast = forecast_of(composed, stream)
     del forecast["composers"]
     judged = {name: forecast.pop(name) for name in ("judged", "reason", "trial")}
@@ -288,13 +289,13 @@ def _forecast(composed: Composed, stream: Stream, scores: Sequence[ComposerScore
 
 
 def _demand(stream: Stream, sample_time_s: float) -> dict[str, float]:
-    """The largest command and speed of the signal as it is sent."""
+    """Returns the largest command and speed of the signal as it is sent."""
     command_mm, speed = drive.demand(stream.u, sample_time_s=sample_time_s)
     return {"largest_command_mm": command_mm, "largest_speed_mm_per_s": speed}
 
 
 def _by_composer(scores: Sequence[ComposerScore]) -> dict[str, Any]:
-    """The figures of one stream."""
+    """Returns the figures of one stream."""
     errors = {
         score.composer: {
             "rms_percent_of_on_off": score.rms_percent_of_on_off,

@@ -1,5 +1,5 @@
-"""Pressure advance, the controller that owners have: a command in proportion to the wanted flow and to its
-change, smoothed; tuned on the identified chain, so that it costs no further print."""
+"""Pressure advance, the controller that printer owners have: a command in proportion to the wanted flow and
+to its rate of change, smoothed. It is tuned on the identified chain, so it needs no further print."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,8 @@ SMOOTH_S = 0.04
 # ln gain, advance, smooth time (Klipper takes no more) and lead
 LOW, HIGH = np.array([math.log(1e-3), 0.0, 0.0, 0.0]), np.array([math.log(1e3), 100.0, 0.2, 1.0])
 SCALE = np.array([0.1, 1.0, 0.1, 0.1])
-# of 50 foreign extruders twice as far holds the best advance in 96 %, once in 76 %
+# for 50 unfamiliar extruders an interval twice as wide contains the best advance in 96 %, the single one in
+# 76 %
 WIDER = 2.0
 # midpoints of the triangular window, in halves of it
 NODES = (np.arange(256) + 0.5) / 128 - 1
@@ -35,7 +36,7 @@ class PressureAdvance(NamedTuple):
 
 
 class TunedAdvance(NamedTuple):
-    """Pressure advance as tuned, and the ends of the 90 % interval of each of its numbers."""
+    """The tuned pressure advance, and the ends of the 90 % interval of each of its numbers."""
 
     low: PressureAdvance
     tuned: PressureAdvance
@@ -43,12 +44,12 @@ class TunedAdvance(NamedTuple):
 
 
 def command(pa: PressureAdvance, r: np.ndarray, *, sample_time_s: float) -> np.ndarray:
-    """The command u (..., T) in mm for the wanted flow r (..., T) in mm^3/s, 0 beyond its ends:
+    """Returns the command u (..., T) in mm for the wanted flow r (..., T) in mm^3/s, 0 beyond its ends:
 
         u(t) = 1/K integral of w(s) x(t + lead + s) ds,  x = r + advance r'
         w(s) = (h - |s|) / h^2 for |s| < h,  h = smooth / 2
 
-    That is the speed of an extruder whose position is the nominal one and advance times its speed, smoothed
+    That is the speed of an extruder whose position is the nominal one plus advance times its speed, smoothed
     (Klipper, docs/Kinematics.md, pressure advance).
     """
     weight, Ts = 1 - np.abs(NODES), sample_time_s
@@ -65,12 +66,13 @@ def command(pa: PressureAdvance, r: np.ndarray, *, sample_time_s: float) -> np.n
 def tune(
     chain: Chain, missed: forecast.Missed, wanted: Sequence[np.ndarray], *, lead: bool, sample_time_s: float
 ) -> TunedAdvance:
-    """The numbers with the least squared error of the chain's flow from the wanted flows, each (T,) in
-    mm^3/s: gain, advance and smooth time, or, with a lead, gain, advance and lead at Klipper's smooth time.
-    The drive is left out: at its limits the best advance is the largest, and no number of the extruder.
+    """Returns the numbers with the least squared error of the chain's flow from the wanted flows, each (T,)
+    in mm^3/s: gain, advance and smooth time, or, with a lead, gain, advance and lead at Klipper's smooth
+    time. The drive is left out, because at its limits the best advance would be the largest, which is no
+    property of the extruder.
 
-    The interval reaches WIDER times as far as the numbers for what else may come out (`forecast.flows`), each
-    by one step of Gauss-Newton within the bounds.
+    The interval reaches WIDER times as far as the numbers for the other possible flows (`forecast.flows`),
+    each by one step of Gauss-Newton within the bounds.
     """
     r = np.zeros((len(wanted), max(map(len, wanted))))
     for row, one in zip(r, wanted, strict=True):
@@ -107,10 +109,11 @@ def tune(
 
 
 def slicer_settings(advance: TunedAdvance, on_off_gain: float) -> dict[str, str | list[float]]:
-    """What a slicer and a firmware take, each number with the ends of its 90 % interval around it, and the
-    lines that set them: Klipper, Marlin (M900 knows no smooth time) and OrcaSlicer.
+    """Returns the numbers for a slicer and a firmware, each with the ends of its 90 % interval around it, and
+    the lines that set them: Klipper, Marlin (M900 has no smooth time) and OrcaSlicer.
 
-    The flow ratio is the gain that on-off control set out with over the tuned one, both in mm^3/s per mm.
+    The flow ratio is the gain with which on-off control started, divided by the tuned one, both in mm^3/s per
+    mm.
     """
     of_each = list(zip(*advance, strict=True))
     ratios = sorted(on_off_gain / gain for gain in of_each[0])

@@ -1,4 +1,4 @@
-"""What was learned, as the columns of a table and as JSON, and back."""
+"""Converts the results of learning to the columns of a table and to JSON, and back."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ COLUMNS = ("task", "material", "nozzle_mm", "speed_mm_per_s", "pause_s", "lead",
 
 
 def to_table(library: Library) -> dict[str, list]:
-    """Columns of library.parquet, a row for each basis signal."""
+    """Returns the columns of library.parquet, a row for each basis signal."""
     rows = [
         (b.task, b.material, b.nozzle_mm, b.speed, b.pause_s, b.lead, len(b.signal), b.signal)
         for b in library.columns
@@ -26,7 +26,7 @@ def to_table(library: Library) -> dict[str, list]:
 
 
 def to_json(learned: LearnedLibrary) -> dict[str, Any]:
-    """All but the basis signals, as learned.json."""
+    """Returns everything except the basis signals, as learned.json."""
     return {
         "sample_time_s": learned.library.sample_time_s,
         "marks": {name: list(pair) for name, pair in learned.library.marks.items()},
@@ -55,17 +55,17 @@ def _material_to_json(material: LearnedMaterial) -> dict[str, Any]:
 
 
 def finite(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The same with null for what JSON has no number for."""
+    """Returns the same values, with null for numbers that JSON cannot hold."""
     return {key: finite_or_none(value) for key, value in values.items()}
 
 
 def finite_or_none(value: Any) -> Any:
-    """None for NaN and infinity."""
+    """Returns None for NaN and infinity, else the value."""
     return None if isinstance(value, float | np.floating) and not math.isfinite(value) else value
 
 
 def restore(table: Mapping[str, np.ndarray], rest: Mapping[str, Any]) -> LearnedLibrary:
-    """What `to_table` and `to_json` made. Raises ValueError for other JSON."""
+    """Returns the library that `to_table` and `to_json` wrote. Raises ValueError for other JSON."""
     names = [name for name in COLUMNS if name != "length"]
     columns = tuple(
         Basis(
@@ -120,8 +120,8 @@ def _extruder(values: Mapping[str, float | None]) -> IdentifiedExtruder:
 def trainings(
     samples: Mapping[str, np.ndarray], law: str, routines: Sequence[Routine], nozzle_mm: float
 ) -> list[Training]:
-    """All trials of a law, by material and routine, of the columns of lessons.parquet; those of the reference
-    routine only if there is no other. Raises TooFewTrials if there is none."""
+    """Returns all trials of a law, by material and routine, from the columns of lessons.parquet. Those of the
+    reference routine are used only if there is no other. Raises TooFewTrials if there is none."""
     of_law = samples["law"] == law
     if not of_law.any():
         there = ", ".join(sorted(set(samples["law"])))

@@ -113,7 +113,7 @@ UNSUPPORTED = {
     50: "G5 is not supported; export arcs or lines",
     921: "G92.1 is not supported; write G92 and the coordinates",
 }
-# words whose numbers are taken as they stand: key, letters, least and largest
+# words whose numbers are used as they are: key, letters, least and largest
 BOUNDS = (
     (M + 2000, "D", 0.0, 200.0), (M + 2200, "S", 1.0, 10_000.0), (M + 2210, "S", 0.0, 10_000.0),
     (M + 2040, "PS", 0.0, 1e9),
@@ -132,7 +132,7 @@ SWITCHING = np.array([M + 10 * k for on, off in SWITCHES.values() for k in on + 
 PINS = 64  # of M42
 TOOLS = 64  # T255, T1000, ... are words of one maker's machine, not tools
 TINY = 1e-9  # mm: below every resolution and above rounding
-# what becomes of words that slicers write into every program
+# how words that slicers write into every program are treated
 KNOWN = {
     "temperatures: none of a move's": "M104 M109 M140 M190 M141 M191 M116 G10",
     "fans and lamps: none of a move's": "M106 M107 M150 M355",
@@ -624,7 +624,7 @@ def _kinds(what: np.ndarray, planar: np.ndarray, vertical: np.ndarray, e: np.nda
     """Returns the kind (N,) of each move. It follows from where the move goes and what E does, unless the
     command's word gives the kind."""
     out, back = e > TINY, e < -TINY
-    # retracted so far: -sum E, but never below nothing, so that printing empties it
+    # retracted so far: -sum E, but never below 0, so that printing empties it
     depth = np.cumsum(-e)
     deep = np.append(0.0, (depth - np.minimum.accumulate(np.minimum(depth, 0.0)))[:-1])[: len(e)] > 1e-6
     kind = np.full(len(what), int(Kind.TRAVEL))

@@ -222,7 +222,8 @@ def _regular(body: bytes, first: int) -> tuple[list[np.ndarray], np.ndarray, int
     # an e between a number and a signed number: an exponent, or the next word? the odd path decides
     e, line = capital == ord("E"), newlines[k]
     behind = e & ((kinds[letter - 1] == DIGIT) | (kinds[letter - 1] == POINT))
-    # without a sign it is a word, as in X1E2; beside another E the odd path says which of both it was
+    # without a sign it is a word, as in X1E2; if the line has another E, the odd path decides which of them
+    # it is
     bad |= behind & (signed | (np.bincount(line[e], minlength=newlines[-1])[line] > 1))
     odd = np.zeros(newlines[-1], bool)
     odd[line[bad]] = True

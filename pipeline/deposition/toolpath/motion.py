@@ -84,7 +84,7 @@ def plan(
     prints = runs & (moves.kind == Kind.EXTRUDE)
     rests = ~np.isfinite(turn)
     if np.isfinite(printing_acceleration):
-        # the corners' speeds are the gantry's own: only along the path it is held back
+        # the corner speeds are the gantry's own; only the acceleration along the path is limited
         a = np.where(prints, np.minimum(a, printing_acceleration), a)
         rests |= np.append(False, prints[1:] != prints[:-1])
     entry, leave = _look_ahead(np.where(rests, 0.0, cap), 2 * a * travel)
@@ -198,7 +198,8 @@ def _at(
     )
     early, late = np.maximum(up - since, 0.0), np.maximum(down - left, 0.0)
     speed = np.clip(cruise - a * (early + late), 0.0, None)
-    # what the ramps take off cruise t, counted from the nearer end, so that rounding never leaves the move
+    # the way that the ramps take off cruise t, counted from the nearer end, so that rounding never leaves the
+    # move
     done = cruise * since - a * (up**2 - early**2 + late**2) / 2
     still = cruise * left - a * (down**2 - late**2 + early**2) / 2
     travel = motion.travel[move]

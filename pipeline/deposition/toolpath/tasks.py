@@ -160,7 +160,7 @@ def refuse(lines: PrintedLines, moves: Moves, *, halts: Collection[int], switch_
     if len(after):
         k = int(after[0])
         span = slice(lines.move[k] + 1, lines.move[k + 1] + 1)
-        # the T word; where the tool changed without one, the line that prints with it
+        # the T word; if the tool changed without one, the line that prints with it
         change = np.append(moves.line[span][moves.kind[span] == Kind.TOOL], moves.line[span][-1])[0]
         raise ValueError(
             f"line {change}: T{lines.tool[k + 1]} comes {lines.begin_s[k + 1] - lines.end_s[k]:.2f} s after "
