@@ -428,14 +428,14 @@ def test_a_verification_is_written_composed_and_shown_beside_what_was_measured(f
 # ---- what a machine may run out of
 
 COMPOSE = ["beadline", "compose", "datasets/parts/fig9.gcode", "--as", "csv,parquet,mcap", "--out", "jobs"]
-WIDER = [*COMPOSE, "--filament-mm", "0.7"]
+LARGER = [*COMPOSE[:2], "larger/fig9.gcode", *COMPOSE[3:]]
 TWICE = """
 import os, resource, sys
 from pathlib import Path
 from pipeline import cli
 sys.argv = {compose}
 cli.main()
-sys.argv = {wider}
+sys.argv = {larger}
 {trouble}
 cli.main()
 """
@@ -463,11 +463,15 @@ def test_composing_on_a_machine_that_runs_out_is_one_sentence_and_leaves_the_las
 ):
     spoil, sentence = TROUBLES[trouble]
     finished.chmod(0o755)
+    Path("larger").mkdir(exist_ok=True)
+    part = Path("datasets/parts/fig9.gcode").read_text()
+    larger = re.sub(r"([XYE])(-?\d+)", lambda word: f"{word[1]}{1.5 * int(word[2]):g}", part)
+    Path("larger/fig9.gcode").write_text(larger)
     monkeypatch.setattr(sys, "argv", COMPOSE)
     cli.main()
     before = {path.name: path.read_bytes() for path in Path("jobs").iterdir()}
     ended = subprocess.run(
-        [sys.executable, "-c", TWICE.format(compose=COMPOSE, wider=WIDER, trouble=spoil)],
+        [sys.executable, "-c", TWICE.format(compose=COMPOSE, larger=LARGER, trouble=spoil)],
         capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)}, timeout=300, check=False,
     )  # fmt: skip
     Path("jobs").chmod(0o755)
@@ -475,7 +479,7 @@ def test_composing_on_a_machine_that_runs_out_is_one_sentence_and_leaves_the_las
     assert "Traceback" not in ended.stderr
     assert {path.name: path.read_bytes() for path in Path("jobs").iterdir()} == before
     # and the next call gives what it would have given
-    monkeypatch.setattr(sys, "argv", WIDER)
+    monkeypatch.setattr(sys, "argv", LARGER)
     cli.main()
     assert {path.name for path in Path("jobs").iterdir()} == set(before)
     assert Path("jobs/fig9.signal.csv").read_bytes() != before["fig9.signal.csv"]
