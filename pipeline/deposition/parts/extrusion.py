@@ -1,5 +1,5 @@
-"""The volume that E presses out: mm^3 of every move by RepRap's arithmetic from the diameter of what E
-pushes, compared with the declared bead."""
+"""What E presses out: mm^3 of every move by RepRap's arithmetic, the diameter of what E pushes, and the
+declared bead beside it."""
 
 import math
 from collections.abc import Mapping
@@ -11,10 +11,10 @@ from pipeline.deposition.toolpath.gcode import Kind, Moves, PartProgram
 
 
 class Extruded(NamedTuple):
-    """The wanted volume of every printed move. volume_mm3 (N,): by E if the diameter of what it pushes is
-    known, else bead area x length; NaN for moves that do not print. by_e (N,): whether it is by E. source: in
-    words, by tool, the origin of the diameter, or why E does not count. area_mm2: by tool the volume in mm^3
-    of 1 mm of E, if known."""
+    """What is wanted of every printed move: volume_mm3 (N,), by E where the diameter of what it pushes is
+    known, else bead area x length, NaN for moves that do not print; by_e (N,) tells which. source: in words
+    by tool where the diameter is from, or why E does not count. area_mm2: by tool the volume in mm^3 of 1 mm
+    of E, if that is known."""
 
     volume_mm3: np.ndarray
     by_e: np.ndarray
@@ -23,8 +23,8 @@ class Extruded(NamedTuple):
 
 
 class VolumeDifference(NamedTuple):
-    """E of one tool compared with the declared bead: both volumes in mm^3 of the lines for which E counts,
-    and the 5 %, 50 % and 95 % quantiles of their bead area in mm^2, weighted by length."""
+    """E of one tool beside the declared bead: volumes in mm^3 of the lines that E counts for, and the 5 %,
+    50 % and 95 % quantiles of their bead area in mm^2, weighted by length."""
 
     tool: int
     by_e_mm3: float
@@ -33,8 +33,8 @@ class VolumeDifference(NamedTuple):
 
 
 def volumes(program: PartProgram, diameter_mm: Mapping[int, float]) -> np.ndarray:
-    """Returns the volume in mm^3 (N,) that E of every move presses out: e x flow x pi d^2 / 4, or e x flow if
-    M200 makes E count mm^3. NaN if neither is known, and if no letter drives the extrusion."""
+    """mm^3 (N,) that E of every move presses out: e x flow x pi d^2 / 4, and e x flow where M200 makes E
+    count mm^3; NaN where neither is known, and where no letter drives the extrusion."""
     moves = program.moves
     if not _lettered(program):
         return np.full(len(moves.line), np.nan)
@@ -50,13 +50,11 @@ def wanted(
     bead_area_mm2: float,
     asked_mm: float | None = None,
     declared_mm: Mapping[int, float] | None = None,
-    scale: float = 1.0,
     declared_bead: bool = False,
 ) -> Extruded:
-    """Returns the volume of every printed move; with declared_bead the declared bead's for all. A tool's
-    diameter is `asked_mm` if given, else the program's (a slicer's comment, M200), else the machine's
-    declared one. Without a diameter its lines are declared beads. For a part made `scale` times as large, E's
-    volume is multiplied by scale^3."""
+    """The volume of every printed move; with declared_bead the declared bead's for all. A tool's diameter is
+    what was asked for, else what the program says (a slicer's comment, M200), else what the machine declares;
+    without one its lines are declared beads."""
     moves, said = program.moves, program.diameter_mm
     printed = (moves.kind == Kind.EXTRUDE) & (moves.length > 0)
     diameter, source, area = {}, {}, {}
@@ -77,7 +75,7 @@ def wanted(
         else:
             diameter[tool], source[tool] = d, f"diameter {d:g} mm, {where}"
             area[tool] = math.pi * d**2 / 4
-    e = volumes(program, diameter) * scale**3
+    e = volumes(program, diameter)
     by_e = printed & np.isfinite(e) & (not declared_bead)
     volume = np.where(by_e, e, np.where(printed, bead_area_mm2 * moves.length, np.nan))
     return Extruded(volume, by_e, source, area)
@@ -89,7 +87,7 @@ def _lettered(program: PartProgram) -> bool:
 
 
 def differences(moves: Moves, extruded: Extruded, *, bead_area_mm2: float) -> list[VolumeDifference]:
-    """Returns the comparison of E with the declared bead, for each tool that has lines for which E counts."""
+    """E beside the declared bead, of each tool whose lines E counts for."""
     found = []
     for tool in np.unique(moves.tool[extruded.by_e]).tolist():
         at = extruded.by_e & (moves.tool == tool)
@@ -104,21 +102,9 @@ def differences(moves: Moves, extruded: Extruded, *, bead_area_mm2: float) -> li
     return found
 
 
-def resized(program: PartProgram, *, scale: float = 1.0, speed: float = 1.0) -> PartProgram:
-    """Returns the program with X, Y and Z `scale` times as large and every feed `speed` times as fast."""
-    moves = program.moves
-    if scale == speed == 1.0:
-        return program
-    moves = moves._replace(
-        start=moves.start * scale, end=moves.end * scale, length=moves.length * scale,
-        centre=moves.centre * scale, feed=moves.feed * speed,
-    )  # fmt: skip
-    return program._replace(moves=moves)
-
-
 def as_lengths(program: PartProgram, extruded: Extruded, *, bead_area_mm2: float) -> PartProgram:
-    """Returns the program with every printed move as long as a declared bead of its volume. A composer wants
-    bead area x length, so it then presses out the volume by E."""
+    """The program with every printed move as long as the declared bead would be of its volume: what a
+    composer, which wants bead area x length, then presses out is what E asks for."""
     moves = program.moves
     length = np.where(extruded.by_e, extruded.volume_mm3 / bead_area_mm2, moves.length)
     return program._replace(moves=moves._replace(length=length))

@@ -1,6 +1,5 @@
-"""Composes a part program: volumes by E, the gantry's plan, the commands of all tools, and whether it will
-print. The plan is as quick as the gantry can, or slower if the drive could not press the flow of quicker
-ramps."""
+"""A part program composed: volumes by E, the gantry's plan, as quick as it can or slower if the drive could
+not press the flow of quicker ramps, the commands of all tools, and whether it will print."""
 
 import math
 from collections.abc import Mapping
@@ -20,9 +19,9 @@ from pipeline.deposition.toolpath import gcode, motion
 from pipeline.deposition.toolpath.gcode import Kind, Moves, PartProgram
 from pipeline.deposition.toolpath.motion import Motion
 
-# a part's ramps grow by this factor until the drive follows, starting at this many seconds
+# a part's ramps grow by this factor until the drive follows, from a first one of so many seconds
 LONGER, FIRST_S = 1.2, 0.1
-# only this much of each tool's printing is judged, so that a long job costs no more than a short one
+# judged on as much of each tool's printing, so that a long job costs no more than a short one
 JUDGED_S = 300.0
 # ramps longer than this are no ramps of a printed line
 LONGEST_RAMP_S = 10.0
@@ -31,7 +30,7 @@ LONGEST_H = 72
 
 
 class ComposedPart(NamedTuple):
-    """A part program after reading, planning and composing, and whether it will print."""
+    """A part program read, planned, composed, and whether it will print."""
 
     name: str
     program: PartProgram
@@ -42,9 +41,8 @@ class ComposedPart(NamedTuple):
     bead_area_mm2: float
 
 
-def parse(data: bytes, *, scale: float = 1.0, speed: float = 1.0, extruder: str = "") -> PartProgram:
-    """Reads the part program with X, Y and Z `scale` times as large and feeds `speed` times as fast. Raises
-    ValueError if nothing of it prints and lines were refused."""
+def parse(data: bytes, *, extruder: str = "") -> PartProgram:
+    """The part program. Raises ValueError if nothing of it prints because what would was refused."""
     program = gcode.parse(data, extruder=extruder)
     if not np.any(program.moves.kind == gcode.Kind.EXTRUDE) and program.refusals:
         first = program.refusals[0]
@@ -52,7 +50,7 @@ def parse(data: bytes, *, scale: float = 1.0, speed: float = 1.0, extruder: str 
             f"line {first.line}: {first.why}; it was left out, "
             "and nothing of the program that could be read prints"
         )
-    return extrusion.resized(program, scale=scale, speed=speed)
+    return program
 
 
 def compose(
@@ -68,12 +66,12 @@ def compose(
     shortest_s: float,
     largest_error_percent: float,
 ) -> ComposedPart:
-    """Composes a part program; `materials` are the tools' names. Raises ValueError, with the line number if
-    there is one."""
+    """A part program, composed; `materials` are the tools' names. Raises ValueError naming the line if there
+    is one."""
     area, moves = settings.bead_area_mm2, program.moves
     planned, _ = plan_part(moves, gantry, settings, learned, materials, longest_ramp_s)
     check_duration(moves, planned)
-    # each printed line is made as long as a declared bead of its volume by E
+    # a printed line is as long as the declared bead would be of the volume that E asks for
     beads = extrusion.as_lengths(program, extruded, bead_area_mm2=area)
     composed = composition.compose(learned, beads, planned, settings, materials=materials)
     report = conformance.conform(
@@ -90,8 +88,7 @@ def compose(
 
 
 def check_duration(moves: Moves, planned: Motion) -> None:
-    """Raises ValueError, naming the line, if the plan is longer than any print, because then an F or a dwell
-    is wrong."""
+    """Raises ValueError, naming the line, for a plan longer than any print: an F or a dwell slipped."""
     hours = float(planned.duration_s.sum()) / 3600
     if not hours <= LONGEST_H:
         slow = int(planned.duration_s.argmax())
@@ -103,8 +100,8 @@ def check_duration(moves: Moves, planned: Motion) -> None:
 
 
 def slowed_to(plan: Motion, moves: Moves) -> float | None:
-    """Returns the acceleration in mm/s^2 of the printed moves if it is less than the program's and the
-    travel's own; None if no move is slowed down."""
+    """mm/s^2 at which the printed moves change speed where that is less than the program's and the travel's
+    own; None if none is slowed down."""
     own = np.fmin(moves.acceleration, plan.acceleration.max(initial=0.0))
     slowed = _prints(moves) & (plan.acceleration < own)
     return float(plan.acceleration[slowed].max()) if slowed.any() else None
@@ -118,11 +115,11 @@ def plan_part(
     materials: dict[int, str],
     longest_s: float | None,
 ) -> tuple[Motion, float]:
-    """Returns the gantry's plan of a part, and the time in s, within 20 %, of the shortest ramps that the
-    drive follows: inf if none up to longest_s does. In the plan the printed moves are as quick as the machine
-    goes, or slower until the drive follows the flow of each material as identified, with ramps of at most
-    longest_s. `gantry` are keywords of `motion.plan`, `materials` the tools' names. Raises ValueError for a
-    plan longer than any print."""
+    """The gantry's plan of a part: its printed moves as quick as the machine goes, or slower until the drive
+    follows the flow of each material as identified, with ramps of at most longest_s. And the time in s, to a
+    fifth, of the shortest ramps that the drive follows: inf if none up to longest_s does. `gantry` are
+    keywords of `motion.plan`, `materials` the tools' names. Raises ValueError for a plan longer than any
+    print."""
     quick = motion.plan(moves, **gantry)
     check_duration(moves, quick)
     if longest_s is None or settings.drive == UNLIMITED:
@@ -150,8 +147,7 @@ def plan_part(
 def _extruders(
     moves: Moves, nozzle_mm: float, learned: LearnedLibrary, materials: dict[int, str]
 ) -> dict[int, Extruder]:
-    """Returns the identified gain, time constant and yield of the material of each tool that prints and has
-    one."""
+    """Gain, time constant and yield, as identified, of the material of each tool that prints and has one."""
     chains = {one.material: one.chain.extruder for one in learned.materials if one.nozzle_mm == nozzle_mm}
     tools = np.unique(moves.tool[_prints(moves)]).tolist()
     identified = {tool: chains.get(materials.get(tool, "")) for tool in tools}
@@ -167,7 +163,7 @@ def _prints(moves: Moves) -> np.ndarray:
 
 
 def _printing_speed(moves: Moves, gantry: Mapping[str, float]) -> float:
-    """Returns the highest speed in mm/s of a printed move, within the gantry's limit."""
+    """The highest speed in mm/s of a printed move, within the gantry's limit."""
     feeds = np.where(np.isfinite(moves.feed), moves.feed, gantry["unset_feed"])[_prints(moves)]
     return min(float(feeds.max(initial=0.0)), gantry["speed_limit"])
 
@@ -175,7 +171,7 @@ def _printing_speed(moves: Moves, gantry: Mapping[str, float]) -> float:
 def _lost(
     plan: Motion, moves: Moves, settings: PartSettings, extruders: dict[int, Extruder], Ts: float
 ) -> float:
-    """Returns the largest loss of a tool's flow by the drive (`reachable.lost`) in the first JUDGED_S of its
+    """The most that the drive takes of a tool's flow (`reachable.lost`) in the first JUDGED_S of its
     printing."""
     signal, shares = motion.sampled(plan, moves, sample_time_s=Ts, rates_only=True), []
     for tool, extruder in extruders.items():
