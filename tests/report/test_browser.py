@@ -280,7 +280,7 @@ def test_text_from_the_data_runs_nothing_even_where_it_were_not_escaped(open_pag
 
 
 @pytest.mark.parametrize(
-    ("name", "closed"), [("deposition", ("declared", "lines")), ("setpoint", ("vision", "why"))]
+    ("name", "closed"), [("deposition", ("frames", "lines")), ("setpoint", ("vision", "why"))]
 )
 def test_a_second_level_of_detail_is_closed_opens_at_its_heading_and_prints(open_page, name, closed):
     page = open_page(name, folded=True)

@@ -40,9 +40,8 @@ def heating():
 def test_where_no_feedback_is_recognised_it_is_said_with_the_input_that_comes_nearest_to_feedback(project):
     text = page()
     assert (
-        "No feedback was recognised. No input responds detectably to past errors of the outputs: least p = 0.030, "
-        "heater_2; "
-        "feedback is called below 0.00025." in text
+        "No feedback was recognised. No input responds detectably to past errors of the outputs: "
+        "least p = 0.030, heater_2; feedback is called below 0.00025." in text
     )
     assert "The fit in simulation flatters." not in text
 

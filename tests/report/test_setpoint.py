@@ -319,7 +319,7 @@ def test_how_many_frames_of_good_prints_are_named_good_stands_on_the_page(projec
     table = artifacts.read_table("datasets/train_classifier/classified.parquet", CLASSIFIED)
     good = table["label"] == 1
     percent = 100 * (table["named"][good] == 1).mean()
-    assert f"Of {good.sum()} frames of good prints {percent:.0f} % are named good." in page()
+    assert f"Of {good.sum()} frames of good prints {percent:.0f} % are classified as good." in page()
 
 
 # ---- what the camera sees, by flow
@@ -354,7 +354,8 @@ def test_right_is_told_by_flow_the_worst_bin_first(project):
         "It lies beside a border of the classes. Worst away from the borders: 70–75 % of flow, 90 % right"
     ) in text
     assert (
-        "If every flow from 70 to 150 % were as frequent: 82.5 % (80.1–84.9); the ideal reader 88.0 %." in text
+        "If every flow from 70 to 150 % were as frequent: 82.5 % (80.1–84.9); the ideal reader 88.0 %."
+        in text
     )
     assert "every segment carries a width bias of 5 %" in text
     table = PAGE.read_text().split("tight by-flow")[1].split("</table>")[0]
