@@ -521,3 +521,18 @@ def test_adr_helps_only_if_it_gains_more_than_chance_over_segments(monkeypatch, 
     found = papers_camera.robustness([judged] * 3, {"mask": none, "mask_adr": adr})
     assert (found["ways"], found["helping"], found["helps"]) == (16, helping, helping > 0)
     assert found["best"]["gains"] == pytest.approx(100 * len(adr) / 8 - 50)
+
+
+def test_one_record_that_raises_the_curve_of_a_controller_is_named():
+    """Against the raw costs: each that is more than ten times the median of its length, and no other."""
+    found = json.loads((ROOT / "datasets/papers/relearned.json").read_text(encoding="utf-8"))
+    said = page._by_length(str(ROOT / "datasets/papers/relearned.json"))["apart"]
+    high = [
+        (int(samples), name, cost)
+        for samples, answered in found["curve"]["answers"].items()
+        for name, costs in answered["costs"].items()
+        for cost in costs
+        if name in found["curve"]["controllers"] and cost > 10 * sorted(costs)[len(costs) // 2]
+    ]
+    assert [row[:3] for row in said] == high
+    assert (60000, "subspace_lqg") in [row[:2] for row in said]

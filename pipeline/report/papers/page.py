@@ -7,6 +7,7 @@ made and whether its method has changed since. No verdict, choice or export read
 """
 
 from collections.abc import Mapping, Sequence
+from statistics import median
 from typing import Any
 
 from pipeline.papers import made
@@ -89,7 +90,21 @@ def _by_length(path: str) -> dict[str, Any]:
         return found
     curve, step = found["curve"], found["sample_time_s"]
     finding = crossing_sentence(curve, step, "these lengths")
-    return found | {"finding": finding, "picture": cost_curve(curve, step, finding), "key": cost_key(curve)}
+    found |= {"finding": finding, "picture": cost_curve(curve, step, finding), "key": cost_key(curve)}
+    return found | {"apart": _apart(curve)}
+
+
+def _apart(curve: Mapping[str, Any]) -> list[tuple[int, str, float, float]]:
+    """Returns the records on which a controller costs more than ten times its median of that length: samples,
+    controller, cost and median."""
+    return [
+        (int(samples), name, cost, median(costs))
+        for samples, answered in curve["answers"].items()
+        for name, costs in answered["costs"].items()
+        if name in curve["controllers"]
+        for cost in costs
+        if cost > 10 * median(costs)
+    ]
 
 
 def decision(papers: Sequence[Paper]) -> str:
