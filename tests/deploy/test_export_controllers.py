@@ -144,16 +144,16 @@ def test_measured_figures_are_the_same_after_a_round_trip(project):
 
 def test_an_export_of_what_is_no_controller_is_refused_in_a_sentence(tmp_path):
     with pytest.raises(ValueError, match="is no folder; give a CONTROLLER folder with controller.json"):
-        export.export(tmp_path / "none", "c", None, "extruder")
+        export.export(tmp_path / "none", "c", None)
     why = {"temperature": {"why": "Not exported: Fail. First failed rule: disk margin."}}
     (tmp_path / "exported.json").write_text(json.dumps(why))
     with pytest.raises(
         ValueError, match="temperature has no controller.json. Not exported: Fail. First failed"
     ):
-        export.export(tmp_path / "temperature", "c", None, "extruder")
+        export.export(tmp_path / "temperature", "c", None)
     (tmp_path / "out").write_text("")
     with pytest.raises(ValueError, match="should be a folder but is a file"):
-        export.export(tmp_path, "c", tmp_path / "out", "extruder")
+        export.export(tmp_path, "c", tmp_path / "out")
 
 
 def recording(folder, **changed):
@@ -224,9 +224,9 @@ def test_an_export_that_finds_the_disk_full_leaves_what_was_there(tmp_path, monk
         if text == "second":
             monkeypatch.setattr(artifacts, "write_text", full)
             with pytest.raises(OSError, match=r"c/b\.c.*No space left on device"):
-                export.export(tmp_path, "c", tmp_path / "c", "")
+                export.export(tmp_path, "c", tmp_path / "c")
         else:
-            export.export(tmp_path, "c", tmp_path / "c", "")
+            export.export(tmp_path, "c", tmp_path / "c")
     assert {path.name: path.read_text() for path in (tmp_path / "c").iterdir()} == {
         "a.c": "first",
         "b.c": "first",

@@ -165,13 +165,13 @@ FILES = {"classifier.safetensors", "flow_reader.py", "filter.safetensors", "flow
 
 def test_the_command_exports_the_folder_of_the_stage(model, tmp_path):
     to_setpoint.write(tmp_path / "made", to_setpoint.weights(model, fitted()))
-    told = export.export(tmp_path / "made", "python", tmp_path / "out", "extruder")
+    told = export.export(tmp_path / "made", "python", tmp_path / "out")
     assert told.startswith("classifier, filter. It has no certificate")
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
     for name in FILES:
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "made" / name).read_bytes()
     with pytest.raises(ValueError, match="run in Python alone, found --to c; write --to python"):
-        export.export(tmp_path / "made", "c", None, "extruder")
+        export.export(tmp_path / "made", "c", None)
     artifacts.write_text(tmp_path / "made" / "filter.safetensors", "broken")
     with pytest.raises(ValueError, match=r"filter.safetensors holds no whole weights"):
-        export.export(tmp_path / "made", "python", None, "extruder")
+        export.export(tmp_path / "made", "python", None)
