@@ -61,12 +61,8 @@ def curve_sentence(figures: Figures) -> str:
     "" if no controller was learned again from a part of it."""
     compared = comparison(figures)
     curve, step = entry(compared, "cost_curve"), entry(compared, "sample_time_s")
-    return crossing_sentence(curve, step, "this record") if isinstance(curve, Mapping) else ""
-
-
-def crossing_sentence(curve: Mapping[str, Any], step: float, here: str) -> str:
-    """Returns the same sentence for a curve of record_length.curves. `step`: sample time in seconds; `here`:
-    name of the lengths that were tried."""
+    if not isinstance(curve, Mapping):
+        return ""
     a, b = curve["pair"]
     known = [
         (length, *costs)
@@ -78,21 +74,21 @@ def crossing_sentence(curve: Mapping[str, Any], step: float, here: str) -> str:
         if None not in costs
     ]
     if len(known) < 2:
-        return f"One of the pair could not be learned from less than {here}."
+        return "One of the pair could not be learned from less than this record."
     minutes = [number(length * step / 60, 0) for length, *_ in known]
     ahead = [in_a_sentence(a if one < other else b) for _, one, other in known]
     crossing = curve["crossing"]
     if crossing["samples"] is None:
         return (
             f"{ahead[-1][:1].upper()}{ahead[-1][1:]} costs less at every length from {minutes[0]} to "
-            f"{minutes[-1]} min. The pair does not change places within {here}."
+            f"{minutes[-1]} min. The pair does not change places within this record."
         )
     at = number(crossing["samples"] * step / 60, 0)
     ends = [crossing[end] and crossing[end] * step / 60 for end in ("low", "high")]
     if None in ends:
         return (
             f"The pair changes places at {at} min on average, which is not sure: the 90 % interval does not "
-            f"end within {here}."
+            "end within this record."
         )
     interval = f"90 % interval {band(*ends, 0) or number(ends[0], 0)} min"
     return f"The pair changes places at {at} min ({interval}): from there on {ahead[-1]} costs less."

@@ -536,3 +536,33 @@ def test_one_record_that_raises_the_curve_of_a_controller_is_named():
     ]
     assert [row[:3] for row in said] == high
     assert (60000, "subspace_lqg") in [row[:2] for row in said]
+
+
+@pytest.mark.parametrize(
+    ("winners", "sentence"),
+    [
+        (
+            [{"subspace_lqg": 2, "None": 1}, {"varx_riccati": 2, "subspace_lqg": 1}],
+            "The model-based controller wins from records of 25 min (2 of 3) and 100 min (3 of 3). "
+            "No length turns the answer round.",
+        ),
+        (
+            [{"subspace_lqg": 2, "None": 1}, {"learned_kernel": 3}],
+            "The model-based controller wins from records of 25 min (2 of 3). "
+            "The data-driven controller wins from records of 100 min (3 of 3).",
+        ),
+        (
+            [{"None": 3}, {"predictive_control": 1, "learned_kernel": 1, "None": 1}],
+            "The data-driven controller wins from records of 100 min (2 of 3). "
+            "The other lengths decide nothing.",
+        ),
+        ([{"None": 2, "pi": 1}, {"None": 3}], "No length gives one kind most of the records."),
+    ],
+)
+def test_the_kind_that_wins_most_records_of_a_length_is_said(winners, sentence):
+    """By hand; a kind wins by whichever of its controllers answered, a baseline counts for neither."""
+    answers = {
+        str(samples): {"records": 3, "pair_winner": won}
+        for samples, won in zip((1500, 6000), winners, strict=True)
+    }
+    assert page._pair_by_length(answers, 1.0) == sentence

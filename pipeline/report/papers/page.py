@@ -19,8 +19,9 @@ from pipeline.report.shared.pictures import as_table
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature.pictures import cost_curve, cost_key
 from pipeline.store import artifacts
+from pipeline.verdict.controllers import BY_NAME
+from pipeline.verdict.digits import listed, number
 from pipeline.verdict.evidence import Absent, known
-from pipeline.verdict.pairs import crossing_sentence
 from pipeline.verdict.verdict import Missing
 
 # glyph of a verdict, by the states that the pages know
@@ -89,9 +90,29 @@ def _by_length(path: str) -> dict[str, Any]:
     if found["missing"]:
         return found
     curve, step = found["curve"], found["sample_time_s"]
-    finding = crossing_sentence(curve, step, "these lengths")
+    finding = _pair_by_length(curve["answers"], step)
     found |= {"finding": finding, "picture": cost_curve(curve, step, finding), "key": cost_key(curve)}
     return found | {"apart": _apart(curve)}
+
+
+def _pair_by_length(answers: Mapping[str, Any], step: float) -> str:
+    """Says in a sentence which kind wins the pair at each length. Each kind answers by the controller that
+    its own tuning found cheapest, so one kind may win by different controllers."""
+    won: dict[str, list[str]] = {"model-based": [], "data-driven": []}
+    for samples, answered in answers.items():
+        wins = answered["pair_winner"].items()
+        counts = {
+            kind: sum(n for name, n in wins if name in BY_NAME and BY_NAME[name].kind == kind) for kind in won
+        }
+        first = max(counts, key=lambda kind: counts[kind])
+        minutes = f"{number(int(samples) * step / 60, 0)} min ({counts[first]} of {answered['records']})"
+        if 2 * counts[first] > answered["records"]:
+            won[first].append(minutes)
+    said = [f"The {kind} controller wins from records of {listed(at)}." for kind, at in won.items() if at]
+    if len(said) == 1:
+        undecided = len(answers) - sum(map(len, won.values()))
+        said.append("The other lengths decide nothing." if undecided else "No length turns the answer round.")
+    return " ".join(said) or "No length gives one kind most of the records."
 
 
 def _apart(curve: Mapping[str, Any]) -> list[tuple[int, str, float, float]]:
