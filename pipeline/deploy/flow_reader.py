@@ -1,6 +1,6 @@
-"""The flow classifier with numpy alone. It computes class logits, log flow and its standard deviation from key
-areas, and flow and class probabilities from windows. It reads classifier.safetensors, which lies beside this
-file once exported."""
+"""The flow classifier with numpy alone. It computes class logits, log flow and its standard deviation from
+key areas, and flow and class probabilities from windows. It reads classifier.safetensors, which lies beside
+this file once exported."""
 
 import json
 import math
